@@ -1,0 +1,188 @@
+"""Candidate grasps of a prepared cloud: ordered pairs of points, their poses and the cheap geometric masks.
+
+The representation is Edge Grasp Network's (Huang et al. 2023, arXiv 2211.00191, section III), with the limits written
+down in CONVENTIONS.md. Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
+"""
+
+from __future__ import annotations
+
+import math
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tesnet.cloud import PreparedCloud
+from tesnet.geometry import PANDA, Gripper
+from tesnet.query import GraspQuery
+
+TIP_BEYOND_CONTACT = 0.007
+"""How far the fingertips reach past the depth of the contact point."""
+
+
+@dataclass(frozen=True, slots=True)
+class CandidateConfig:
+    """Which pairs of points are candidates; travels with the weights.
+
+    Args:
+        max_pair_distance: |d| of contact point from approach point.
+        max_depth, min_depth: limits of |d_perp|, the depth of the grasp.
+        min_offset, max_offset: limits of d . n_c, so that one fingertip closes onto the contact point from outside.
+        max_upward: largest z . up of the direction of travel.
+        support_clearance: least distance of the hand from the support plane.
+    """
+
+    max_pair_distance: float = 0.038
+    min_depth: float = 0.003
+    max_depth: float = 0.040
+    min_offset: float = -0.003
+    max_offset: float = 0.038
+    max_upward: float = 0.1
+    support_clearance: float = 0.004
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Candidates:
+    """C candidate grasps.
+
+    Args:
+        approach: (C,) indices of the approach points in the cloud.
+        contact: (C,) indices of the contact points.
+        Ts_canonical_grasp: (C, 4, 4) TCP poses: +z the direction of travel, +y the closing direction.
+    """
+
+    approach: Tensor
+    contact: Tensor
+    Ts_canonical_grasp: Tensor
+
+    def __len__(self) -> int:
+        return len(self.approach)
+
+    def select(self, which: Tensor) -> Candidates:
+        """The candidates at the indices (K,), or where the mask (C,) is true."""
+        return Candidates(self.approach[which], self.contact[which], self.Ts_canonical_grasp[which])
+
+
+def generate(
+    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, gripper: Gripper = PANDA
+) -> tuple[Candidates, dict[str, int]]:
+    """At most `max_candidates` candidates, and how many pairs each mask dropped (support, from_below, approach)."""
+    generator = torch.Generator().manual_seed(query.seed)
+    start = int(torch.randint(len(cloud), (1,), generator=generator))
+    approach_points = farthest_points(cloud.points, query.num_approach_points, start)
+    approach, contact = pairs_in_reach(cloud, approach_points, config)
+    poses = grasp_poses(cloud.points[approach], cloud.points[contact], cloud.normals[contact])
+    candidates = Candidates(approach, contact, poses)
+
+    rejected = {}
+    z = candidates.Ts_canonical_grasp[:, :3, 2]
+    masks = {
+        "from_below": _comes_from_behind(cloud, candidates, config),
+        "approach": _outside_cone(cloud, z, query),
+        "support": hand_clearance(cloud, candidates.Ts_canonical_grasp, gripper) < config.support_clearance,
+    }
+    alive = torch.ones(len(candidates), dtype=torch.bool, device=z.device)
+    for name, bad in masks.items():
+        rejected[name] = int((bad & alive).sum())
+        alive &= ~bad
+    survivors = alive.nonzero()[:, 0]
+    if len(survivors) > query.max_candidates:
+        chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values
+        survivors = survivors[chosen.to(survivors.device)]
+    return candidates.select(survivors), rejected
+
+
+def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
+    """Indices (min(count, P),) of points (P, 3) spread evenly, by farthest-point sampling that doubles each round.
+
+    In a round every chosen point's Voronoi cell yields its point farthest from it, so the number of rounds grows with
+    the logarithm of `count`; where fewer are wanted, the farthest ones are taken. Plain farthest-point sampling
+    (Gonzalez 1985) takes one point a round.
+    """
+    chosen = torch.tensor([start], device=points.device)
+    distance = (points - points[start]).norm(dim=1)
+    cell = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    count = min(count, len(points))
+    while len(chosen) < count:
+        reach = torch.zeros(len(chosen), device=points.device).scatter_reduce(0, cell, distance, "amax")
+        is_farthest = (distance == reach[cell]) & (distance > 0)
+        index = torch.where(is_farthest, torch.arange(len(points), device=points.device), len(points))
+        first = torch.full((len(chosen),), len(points), device=points.device).scatter_reduce(0, cell, index, "amin")
+        new = first[(first < len(points))]
+        if len(new) == 0:  # the remaining points coincide with chosen ones
+            break
+        new = new[distance[new].argsort(descending=True, stable=True)[: count - len(chosen)]]
+        to_new = torch.cdist(points, points[new])
+        nearest = to_new.min(dim=1)
+        closer = nearest.values < distance
+        cell = torch.where(closer, nearest.indices + len(chosen), cell)
+        distance = torch.where(closer, nearest.values, distance)
+        distance[new] = 0
+        chosen = torch.cat([chosen, new])
+    return chosen
+
+
+def pairs_in_reach(cloud: PreparedCloud, approach_points: Tensor, config: CandidateConfig) -> tuple[Tensor, Tensor]:
+    """Indices (C,), (C,) of approach and contact points that satisfy the limits on distance, depth and offset."""
+    offsets = cloud.points[None] - cloud.points[approach_points][:, None]
+    along_normal = (offsets * cloud.normals[None]).sum(dim=2)
+    square = offsets.square().sum(dim=2)
+    depth = (square - along_normal.square()).clamp(min=0).sqrt()
+    ok = (
+        (square <= config.max_pair_distance**2)
+        & (depth >= config.min_depth)
+        & (depth <= config.max_depth)
+        & (along_normal >= config.min_offset)
+        & (along_normal <= config.max_offset)
+    )
+    which, contact = ok.nonzero(as_tuple=True)
+    return approach_points[which], contact
+
+
+def grasp_poses(approach_points: Tensor, contact_points: Tensor, contact_normals: Tensor) -> Tensor:
+    """TCP poses (C, 4, 4) of pairs of points (C, 3) and the contact points' unit normals (C, 3).
+
+    z = d_perp / |d_perp| with d_perp the part of d = p_c - p_a across the normal; y = the normal; the fingertips stop
+    7 mm past the depth of the contact point on the line through p_a (CONVENTIONS.md, "The grasp").
+    """
+    d = contact_points - approach_points
+    d_perp = d - (d * contact_normals).sum(dim=1, keepdim=True) * contact_normals
+    depth = d_perp.norm(dim=1, keepdim=True)
+    z = d_perp / depth
+    y = contact_normals - (contact_normals * z).sum(dim=1, keepdim=True) * z
+    y = y / y.norm(dim=1, keepdim=True)
+    x = torch.linalg.cross(y, z, dim=1)
+    tcp = approach_points + (depth + TIP_BEYOND_CONTACT - PANDA.tip_offset) * z
+    poses = torch.zeros(len(d), 4, 4, dtype=d.dtype, device=d.device)
+    poses[:, :3, :] = torch.stack([x, y, z, tcp], dim=2)
+    poses[:, 3, 3] = 1
+    return poses
+
+
+def hand_clearance(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Tensor:
+    """(C,) metres between the support plane and the lowest corner of the open hand; infinite without a plane."""
+    if cloud.up is None or cloud.support_height is None:
+        return torch.full((len(Ts_canonical_grasp),), math.inf, device=Ts_canonical_grasp.device)
+    centres, half_extents = (
+        torch.tensor(array, dtype=Ts_canonical_grasp.dtype, device=Ts_canonical_grasp.device)
+        for array in gripper.boxes(gripper.max_width)
+    )
+    up_in_grasp = (Ts_canonical_grasp[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
+    tcp_height = Ts_canonical_grasp[:, :3, 3] @ cloud.up - cloud.support_height
+    lowest = up_in_grasp @ centres.T - up_in_grasp.abs() @ half_extents.T
+    return tcp_height + lowest.min(dim=1).values
+
+
+def _comes_from_behind(cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig) -> Tensor:
+    """Mask of candidates that travel upwards or, where up is unknown, towards the camera."""
+    z = candidates.Ts_canonical_grasp[:, :3, 2]
+    against = cloud.view_directions[candidates.approach] if cloud.up is None else cloud.up.expand_as(z)
+    return (z * against).sum(dim=1) >= config.max_upward
+
+
+def _outside_cone(cloud: PreparedCloud, z: Tensor, query: GraspQuery) -> Tensor:
+    if query.approach is None:
+        return torch.zeros(len(z), dtype=torch.bool, device=z.device)
+    direction = cloud.T_cloud_canonical.inverse().rotate(query.approach.direction)
+    wanted = torch.tensor(direction, dtype=z.dtype, device=z.device)
+    return z @ wanted < math.cos(math.radians(query.approach.max_angle_deg)) - 1e-6

@@ -1,0 +1,313 @@
+"""Raw points become a prepared cloud: cropped, on a voxel grid, without outliers, with normals and a kNN graph.
+
+Everything is vectorised torch and runs on the device of its inputs. Lengths are metres. The work is done in the
+cloud's canonical frame, which moves with the cloud; grid and order of the points therefore do too.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tesnet.geometry import Pose
+from tesnet.query import GraspQuery
+
+MINIMUM_POINTS = 32
+"""Fewer prepared points than this describe no surface to grasp."""
+
+SUPPORT_CLEARANCE = 0.005
+"""Points lower than this above the support plane belong to it."""
+
+
+@dataclass(frozen=True, slots=True)
+class PreparationConfig:
+    """How a cloud is prepared; travels with the weights that were trained on it.
+
+    Args:
+        voxel_size: edge of the grid's cells.
+        outlier_neighbours, outlier_std_ratio: a point whose mean distance to that many neighbours exceeds the
+            cloud's mean by more than the ratio times the standard deviation is dropped.
+        normal_neighbours, normal_radius: points that a normal is fitted to, the point itself included.
+        graph_neighbours: k of the kNN graph, the point itself included.
+        max_points: larger prepared clouds are cropped to the points nearest their median.
+        max_extent: points farther than this from the median of the cloud are ignored.
+    """
+
+    voxel_size: float = 0.0045
+    outlier_neighbours: int = 20
+    outlier_std_ratio: float = 3.0
+    normal_neighbours: int = 30
+    normal_radius: float = 0.03
+    graph_neighbours: int = 16
+    max_points: int = 12_000
+    max_extent: float = 10.0
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class PreparedCloud:
+    """P points on a surface, in the canonical frame.
+
+    Args:
+        points: (P, 3).
+        normals: (P, 3) unit, outward: turned towards the viewpoint that sees the point best.
+        neighbours: (P, k) indices of the nearest points, the point itself first.
+        spectrum: (P, 2) the smaller two eigenvalues of the local covariance, each divided by the sum of the three.
+        view_directions: (P, 3) unit, from the point to that viewpoint.
+        viewpoints: (V, 3).
+        up: (3,) or None.
+        support_height: along `up`, in this frame, or None.
+        T_cloud_canonical: back to the frame of the query.
+        dropped_far, dropped_surplus: points ignored because of `max_extent` and of `max_points`.
+    """
+
+    points: Tensor
+    normals: Tensor
+    neighbours: Tensor
+    spectrum: Tensor
+    view_directions: Tensor
+    viewpoints: Tensor
+    up: Tensor | None
+    support_height: float | None
+    T_cloud_canonical: Pose
+    dropped_far: int = 0
+    dropped_surplus: int = 0
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+
+def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) -> PreparedCloud | None:
+    """The prepared cloud of a query, or None when no point lies in the workspace above the support plane."""
+    raw = torch.from_numpy(query.points.copy()).to(device)
+    points = crop(raw, query)
+    median = points.median(dim=0).values if len(points) else torch.zeros(3, device=device)
+    near = ((points - median).norm(dim=1) <= config.max_extent) if len(points) else torch.zeros(0, dtype=torch.bool)
+    dropped_far = int((~near).sum())
+    points = points[near] if dropped_far else points
+    if len(points) == 0:
+        return None
+
+    viewpoints = torch.zeros(1, 3) if query.viewpoints is None else torch.tensor(query.viewpoints)
+    up = None if query.up is None else torch.tensor(query.up)
+    T_cloud_canonical = canonical_frame(points, viewpoints.to(device), None if up is None else up.to(device))
+    rotation = torch.tensor(T_cloud_canonical.rotation)
+    origin = torch.tensor(T_cloud_canonical.translation)
+
+    def to_canonical(positions: Tensor) -> Tensor:
+        return ((positions.double() - origin.to(positions.device)) @ rotation.to(positions.device)).float()
+
+    points = voxel_downsample(to_canonical(points), config.voxel_size)
+    viewpoints = to_canonical(viewpoints).to(device)
+    dropped_surplus = max(0, len(points) - config.max_points)
+    if dropped_surplus:
+        distance = (points - points.median(dim=0).values).norm(dim=1)
+        points = points[distance.argsort(stable=True)[: config.max_points].sort().values]
+
+    neighbours = nearest_neighbours(points, max(config.normal_neighbours, config.outlier_neighbours + 1))
+    keep = ~statistical_outliers(points, neighbours[:, : config.outlier_neighbours + 1], config.outlier_std_ratio)
+    points, neighbours = drop_points(points, neighbours, keep)
+    normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
+    normals, view_directions = orient_normals(points, normals, viewpoints)
+    support_height = None
+    if query.up is not None and query.support_height is not None:
+        support_height = float(query.support_height - T_cloud_canonical.translation @ query.up)
+    return PreparedCloud(
+        points=points,
+        normals=normals,
+        neighbours=neighbours[:, : config.graph_neighbours],
+        spectrum=spectrum,
+        view_directions=view_directions,
+        viewpoints=viewpoints,
+        up=None if up is None else (up @ rotation).float().to(device),
+        support_height=support_height,
+        T_cloud_canonical=T_cloud_canonical,
+        dropped_far=dropped_far,
+        dropped_surplus=dropped_surplus,
+    )
+
+
+def crop(points: Tensor, query: GraspQuery) -> Tensor:
+    """Points (N, 3) inside the query's workspace and at least 5 mm above its support plane."""
+    if query.workspace is not None:
+        low = torch.tensor(query.workspace.minimum, dtype=points.dtype, device=points.device)
+        high = torch.tensor(query.workspace.maximum, dtype=points.dtype, device=points.device)
+        points = points[((points >= low) & (points <= high)).all(dim=1)]
+    if query.support_height is not None and query.up is not None:
+        heights = points @ torch.tensor(query.up, dtype=points.dtype, device=points.device)
+        points = points[heights >= query.support_height + SUPPORT_CLEARANCE]
+    return points
+
+
+def canonical_frame(points: Tensor, viewpoints: Tensor, up: Tensor | None) -> Pose:
+    """T_cloud_canonical of a frame that moves with the cloud: origin at the centroid, z along `up`.
+
+    Without `up`, z points to the first viewpoint. x is the direction perpendicular to z of the first viewpoint, or,
+    where that is z itself, of the cloud's largest spread.
+    """
+    cloud = points.double()
+    centroid = cloud.mean(dim=0)
+    to_viewer = viewpoints[0].double() - centroid
+    z = _unit_or_none(to_viewer) if up is None else up.double()
+    if z is None:
+        z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=points.device)
+    x = _unit_or_none(to_viewer - (to_viewer @ z) * z)
+    if x is None:
+        centred = cloud - centroid
+        flat = centred - (centred @ z)[:, None] * z
+        spread = torch.linalg.eigh(flat.T @ flat).eigenvectors[:, 2]
+        x = _unit_or_none(spread - (spread @ z) * z)
+        if x is None:  # every point on one line along z
+            x = _unit_or_none(
+                torch.linalg.cross(z, torch.eye(3, dtype=torch.float64, device=z.device)[z.abs().argmin()])
+            )
+            assert x is not None
+        third_moment = float(((centred @ x) ** 3).sum())
+        x = -x if third_moment < 0 else x
+    rotation = torch.stack([x, torch.linalg.cross(z, x), z], dim=1)
+    return Pose(rotation.cpu().numpy(), centroid.cpu().numpy())
+
+
+def _unit_or_none(vector: Tensor) -> Tensor | None:
+    length = vector.norm()
+    return None if float(length) < 1e-6 else vector / length
+
+
+def voxel_downsample(points: Tensor, voxel_size: float) -> Tensor:
+    """The mean of the points (N, 3) in every occupied cell, (V, 3), in the order of the cells.
+
+    The grid's corner lies half a cell below the smallest coordinates, as in Open3D.
+    """
+    cells = ((points - points.min(dim=0).values) / voxel_size + 0.5).floor().long()
+    extent = cells.max(dim=0).values + 1
+    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    _, cell_of_point, counts = keys.unique(return_inverse=True, return_counts=True)
+    sums = torch.zeros(len(counts), 3, dtype=torch.float64, device=points.device)
+    sums.index_add_(0, cell_of_point, points.double())
+    means: Tensor = (sums / counts[:, None]).to(points.dtype)
+    return means
+
+
+def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) -> Tensor:
+    """Indices (Q, k) of the points (P, 3) nearest to each query (Q, 3), nearest first.
+
+    Queries default to the points themselves; each is then its own first neighbour. With fewer than k points the last
+    one is repeated.
+    """
+    sources = points if queries is None else queries
+    available = min(k, len(points))
+    rows = max(1, 4_000_000 // max(1, len(points)))
+    # Squared distances up to a constant a row: float64, or the expanded square would cancel far from the origin.
+    exact = points.double()
+    lengths = exact.square().sum(dim=1)
+    blocks = [
+        torch.addmm(lengths, block.double(), exact.T, alpha=-2).float().topk(available, largest=False).indices
+        for block in sources.split(rows)
+    ]
+    neighbours = torch.cat(blocks)
+    if queries is None:
+        neighbours = _self_first(neighbours)
+    return neighbours if available == k else torch.cat([neighbours, neighbours[:, -1:].expand(-1, k - available)], 1)
+
+
+def _self_first(neighbours: Tensor) -> Tensor:
+    """Puts each row's own index first; coincident points may otherwise come before it or crowd it out."""
+    own = torch.arange(len(neighbours), device=neighbours.device)
+    position = torch.where(neighbours == own[:, None], 0, 1)
+    order = position.sort(dim=1, stable=True).indices
+    neighbours = neighbours.gather(1, order)
+    neighbours[:, 0] = own
+    return neighbours
+
+
+def statistical_outliers(points: Tensor, neighbours: Tensor, std_ratio: float) -> Tensor:
+    """Mask (P,) of points whose mean distance to their neighbours (P, k), themselves included, is unusually large.
+
+    Unusual is above mean + std_ratio * standard deviation over the cloud (as Open3D's remove_statistical_outlier).
+    """
+    mean_distances = (points[neighbours] - points[:, None]).norm(dim=2).mean(dim=1)
+    if len(points) < 2:
+        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    outliers: Tensor = mean_distances > mean_distances.mean() + std_ratio * mean_distances.std()
+    return outliers
+
+
+def drop_points(points: Tensor, neighbours: Tensor, keep: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (P', 3) and exact neighbours (P', k) after dropping the points where `keep` (P,) is false.
+
+    Only rows that had a dropped neighbour are searched again.
+    """
+    if bool(keep.all()):
+        return points, neighbours
+    new_index = keep.cumsum(0) - 1
+    kept_points, kept_neighbours = points[keep], neighbours[keep]
+    stale = (~keep[kept_neighbours]).any(dim=1)
+    renumbered = new_index[kept_neighbours]
+    if len(kept_points) < neighbours.shape[1]:
+        return kept_points, nearest_neighbours(kept_points, neighbours.shape[1])
+    if bool(stale.any()):
+        fresh = nearest_neighbours(kept_points, neighbours.shape[1], kept_points[stale])
+        own = stale.nonzero()[:, 0]
+        moved = torch.where(fresh == own[:, None], 0, 1).sort(dim=1, stable=True).indices
+        fresh = fresh.gather(1, moved)
+        fresh[:, 0] = own
+        renumbered[stale] = fresh
+    return kept_points, renumbered
+
+
+def estimate_normals(points: Tensor, neighbours: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """Unit normals (P, 3) of unknown sign and spectra (P, 2), fitted to the neighbours (P, k) within `radius`.
+
+    The normal is the eigenvector of the smallest eigenvalue of the neighbours' covariance, found in closed form; the
+    spectrum is (smallest, middle) / sum of the eigenvalues.
+    """
+    offsets = (points[neighbours] - points[:, None]).double()
+    weights = (offsets.square().sum(dim=2) <= radius * radius).double()
+    total = weights.sum(dim=1).clamp(min=1)
+    mean = (offsets * weights[..., None]).sum(dim=1) / total[:, None]
+    centred = (offsets - mean[:, None]) * weights[..., None]
+    covariance = centred.transpose(1, 2) @ centred / total[:, None, None]
+    eigenvalues, normals = smallest_eigenvector(covariance)
+    spectrum = eigenvalues[:, :2] / eigenvalues.sum(dim=1, keepdim=True).clamp(min=1e-18)
+    return normals.to(points.dtype), spectrum.to(points.dtype)
+
+
+def smallest_eigenvector(symmetric: Tensor) -> tuple[Tensor, Tensor]:
+    """Ascending eigenvalues (B, 3) and the unit eigenvector (B, 3) of the smallest, of symmetric matrices (B, 3, 3).
+
+    Eigenvalues by the trigonometric solution of the characteristic polynomial (Smith 1961, "Eigenvalues of a
+    symmetric 3 x 3 matrix"); the eigenvector is the longest cross product of two rows of A - lambda I. A matrix
+    without a distinct smallest eigenvalue yields some unit vector.
+    """
+    identity = torch.eye(3, dtype=symmetric.dtype, device=symmetric.device)
+    scale = symmetric.abs().amax(dim=(1, 2)).clamp(min=torch.finfo(symmetric.dtype).tiny)
+    a = symmetric / scale[:, None, None]
+    mean = a.diagonal(dim1=1, dim2=2).mean(dim=1)
+    deviator = a - mean[:, None, None] * identity
+    p = (deviator.square().sum(dim=(1, 2)) / 6).sqrt().clamp(min=1e-150)
+    half_determinant = (torch.linalg.det(deviator / p[:, None, None]) / 2).clamp(-1, 1)
+    angle = half_determinant.acos() / 3
+    turns = torch.tensor([2.0, 4.0, 0.0], dtype=a.dtype, device=a.device) * (torch.pi / 3)
+    eigenvalues = mean[:, None] + 2 * p[:, None] * torch.cos(angle[:, None] + turns)
+    eigenvalues = eigenvalues.sort(dim=1).values
+    shifted = a - eigenvalues[:, :1, None] * identity
+    products = torch.linalg.cross(shifted, shifted[:, [1, 2, 0]], dim=2)
+    lengths = products.norm(dim=2)
+    best = lengths.argmax(dim=1)
+    rows = torch.arange(len(a), device=a.device)
+    vector, length = products[rows, best], lengths[rows, best]
+    degenerate = length < 1e-14
+    vector = torch.where(degenerate[:, None], identity[2].expand_as(vector), vector / length.clamp(min=1e-300)[:, None])
+    return eigenvalues.clamp(min=0) * scale[:, None], vector
+
+
+def orient_normals(points: Tensor, normals: Tensor, viewpoints: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals (P, 3) turned towards, and unit directions (P, 3) to, the viewpoint (of V, 3) most nearly along each."""
+    to_viewpoints = viewpoints[None] - points[:, None]
+    directions = to_viewpoints / to_viewpoints.norm(dim=2, keepdim=True).clamp(min=1e-9)
+    alignment = (directions * normals[:, None]).sum(dim=2)
+    best = alignment.abs().argmax(dim=1)
+    rows = torch.arange(len(points), device=points.device)
+    sign = torch.where(alignment[rows, best] < 0, -1.0, 1.0)
+    return normals * sign[:, None], directions[rows, best]

@@ -1,0 +1,118 @@
+"""The hand's volume, swept along its approach, against the observed cloud and, on request, against what it hides.
+
+Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tesnet.cloud import PreparedCloud
+from tesnet.geometry import Gripper
+
+SHADOW_MARGIN = 0.01
+"""A place is hidden when it lies this far behind the surface that covers it."""
+
+_BLOCK = 4_000_000
+
+
+def in_collision(
+    cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float, approach_distance: float
+) -> Tensor:
+    """Mask (C,): an observed point lies in the hand anywhere on its way to the grasp.
+
+    Args:
+        cloud: P observed points.
+        Ts_canonical_grasp: (C, 4, 4) TCP poses.
+        gripper: the hand; palm and fingers are boxes.
+        width: opening of the fingers.
+        approach_distance: length of the straight approach, which ends in the grasp.
+    """
+    rows = max(1, _BLOCK // max(1, len(cloud)))
+    blocks = [_hit(cloud.points, poses, gripper, width, approach_distance) for poses in Ts_canonical_grasp.split(rows)]
+    return torch.cat(blocks) if blocks else torch.zeros(0, dtype=torch.bool, device=cloud.points.device)
+
+
+def _hit(points: Tensor, poses: Tensor, gripper: Gripper, width: float, approach_distance: float) -> Tensor:
+    x, y, z = points_in_grasp_frames(points, poses)
+    x, y = x.abs_(), y.abs_()
+    palm_front = gripper.tip_offset - gripper.finger_length
+    fingers = (
+        (y > width / 2)
+        & (y < width / 2 + gripper.finger_thickness)
+        & (x < gripper.finger_breadth / 2)
+        & (z < gripper.tip_offset)
+        & (z > palm_front - approach_distance)
+    )
+    palm = (
+        (z < palm_front)
+        & (x < gripper.palm_breadth / 2)
+        & (y < gripper.palm_length / 2)
+        & (z > palm_front - gripper.palm_depth - approach_distance)
+    )
+    return (fingers | palm).any(dim=1)
+
+
+def points_in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and z, each (C, P), of the points (P, 3) in the grasp frames of the poses (C, 4, 4)."""
+    rotations, origins = poses[:, :3, :3], poses[:, :3, 3]
+    shifts = (origins[:, None, :] @ rotations)[:, 0]
+    x, y, z = (torch.addmm(-shifts[:, axis : axis + 1], rotations[:, :, axis], points.T) for axis in range(3))
+    return x, y, z
+
+
+def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float) -> Tensor:
+    """Mask (C,): part of the hand at the grasp lies where every viewpoint's sight is blocked by observed points.
+
+    The fingers and the palm's front are sampled; each viewpoint's nearest range in every direction is kept in an image
+    whose pixels are about as wide as the spacing of the cloud.
+    """
+    samples = torch.tensor(_hand_samples(gripper, width), dtype=torch.float32, device=cloud.points.device)
+    places = samples @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
+    hidden = torch.ones(places.shape[:2], dtype=torch.bool, device=places.device)
+    for viewpoint in cloud.viewpoints:
+        hidden &= _hidden_from(viewpoint, cloud.points, places)
+    return hidden.any(dim=1)
+
+
+def _hand_samples(gripper: Gripper, width: float) -> list[list[float]]:
+    palm_front = gripper.tip_offset - gripper.finger_length
+    depths = [palm_front + gripper.finger_length * step / 4 for step in range(5)]
+    finger_ys = [width / 2 + gripper.finger_thickness * share for share in (0.1, 0.5, 0.9)]
+    fingers = [[0.0, side * y, z] for side in (-1, 1) for y in finger_ys for z in depths]
+    palm = [[0.0, gripper.palm_length / 2 * share, palm_front - 0.005] for share in (-0.9, -0.45, 0.0, 0.45, 0.9)]
+    return fingers + palm
+
+
+def _hidden_from(viewpoint: Tensor, points: Tensor, places: Tensor) -> Tensor:
+    """Mask (C, S) of places (C, S, 3) more than `SHADOW_MARGIN` behind a point seen in the same direction."""
+    rays = points - viewpoint
+    axis = torch.nn.functional.normalize(rays.mean(dim=0), dim=0)
+    helper = torch.eye(3, dtype=points.dtype, device=points.device)[axis.abs().argmin()]
+    across = torch.nn.functional.normalize(torch.linalg.cross(axis, helper), dim=0)
+    basis = torch.stack([across, torch.linalg.cross(axis, across), axis], dim=1)
+
+    def project(vectors: Tensor) -> tuple[Tensor, Tensor]:
+        local = vectors @ basis
+        ahead = local[..., 2].clamp(min=1e-6)
+        return local[..., :2] / ahead[..., None], local[..., 2]
+
+    plane, depth = project(rays)
+    seen = depth > 0
+    plane, depth = plane[seen], depth[seen]
+    if len(depth) == 0:
+        return torch.zeros(places.shape[:2], dtype=torch.bool, device=places.device)
+    # The spacing of the prepared points is near constant, so its angle is spacing / depth.
+    low, high = plane.min(dim=0).values, plane.max(dim=0).values
+    pixel = torch.clamp((high - low).max() / 512, min=float(0.006 / depth.median()))
+    columns = int((high[1] - low[1]) / pixel) + 1
+    rows = int((high[0] - low[0]) / pixel) + 1
+    cells = ((plane - low) / pixel).long()
+    nearest = torch.full((rows * columns,), torch.inf, device=points.device)
+    nearest = nearest.scatter_reduce(0, cells[:, 0] * columns + cells[:, 1], depth, "amin")
+    place_plane, place_depth = project(places - viewpoint)
+    place_cells = ((place_plane - low) / pixel).floor().long()
+    inside = ((place_cells >= 0) & (place_cells < torch.tensor([rows, columns], device=places.device))).all(dim=2)
+    flat = (place_cells[..., 0] * columns + place_cells[..., 1]).clamp(0, rows * columns - 1)
+    return inside & (place_depth > 0) & (place_depth > nearest[flat] + SHADOW_MARGIN)

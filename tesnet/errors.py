@@ -1,0 +1,51 @@
+"""Everything the model library raises on purpose.
+
+::
+
+    TesnetError
+    +-- InvalidQuery    a cloud or an option that no grasp can be computed from; `field` names it
+    +-- WeightsError    a weights file that is missing, corrupted or of another network; `path` names it
+    +-- DeviceError     a compute device that this machine does not have
+
+Messages give the value, the limit and the remedy. They never contain the cloud.
+"""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+
+class TesnetError(Exception):
+    """Base class of this package's errors."""
+
+
+class InvalidQuery(TesnetError):
+    """A query's field holds a value that cannot be used.
+
+    Args:
+        field: name of the option, as on the wire (`points`, `viewpoint`, ...).
+        message: the value, the limit and the remedy.
+    """
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(f"{field}: {message}")
+        self.field = field
+        self.message = message
+
+
+class WeightsError(TesnetError):
+    """A weights file cannot be used.
+
+    Args:
+        path: the file.
+        why: what is wrong with it and what to do.
+    """
+
+    def __init__(self, path: Path | str, why: str) -> None:
+        super().__init__(f"{path}: {why}")
+        self.path = Path(path)
+        self.why = why
+
+
+class DeviceError(TesnetError):
+    """The compute device asked for does not exist on this machine."""

@@ -1,0 +1,19 @@
+"""Frozen geometric values: poses, cameras, the gripper, grasps. numpy only: a robot's computer needs no more."""
+
+from tesnet.geometry.camera import CameraIntrinsics
+from tesnet.geometry.grasp import FRAME_CONVENTIONS, FrameConvention, GraspSet
+from tesnet.geometry.gripper import HAND_TO_TCP, PANDA, Gripper
+from tesnet.geometry.pose import Pose, quaternions_xyzw, unit
+
+__all__ = [
+    "FRAME_CONVENTIONS",
+    "HAND_TO_TCP",
+    "PANDA",
+    "CameraIntrinsics",
+    "FrameConvention",
+    "GraspSet",
+    "Gripper",
+    "Pose",
+    "quaternions_xyzw",
+    "unit",
+]

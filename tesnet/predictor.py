@@ -1,0 +1,257 @@
+"""From a query to ranked grasps: owns the network, its device and the stage timings."""
+
+from __future__ import annotations
+
+import time
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+
+from tesnet import candidates, cloud, collision, networks, ranking, weights
+from tesnet.errors import DeviceError, WeightsError
+from tesnet.geometry import PANDA, GraspSet
+from tesnet.networks import Network
+from tesnet.query import GraspQuery
+from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
+
+APPROACH_DISTANCE = 0.05
+"""Length of the straight approach that is kept clear of observed points, metres."""
+
+
+@dataclass(frozen=True, slots=True)
+class ModelInfo:
+    """Which network answers.
+
+    Args:
+        name, version: of the weights.
+        weights_sha256: of the file.
+        card: data, seed and metrics of the training, as the weights' header tells them.
+        configuration: network, preparation and candidates.
+    """
+
+    name: str
+    version: str
+    weights_sha256: str
+    card: Mapping[str, Any]
+    configuration: Mapping[str, Any]
+
+
+class GraspPredictor:
+    """Answers one query at a time; make it with `GraspPredictor.load`.
+
+    Args:
+        network: in evaluation mode, on `device`.
+        configuration: sections `network`, `preparation` and `candidates`, as in a weights file's header.
+        calibration: (a, b) of score = sigmoid(a * logit + b).
+        model: what to tell about it.
+        device: where everything is computed.
+    """
+
+    def __init__(
+        self,
+        network: Network,
+        configuration: Mapping[str, Any],
+        calibration: tuple[float, float],
+        model: ModelInfo,
+        device: torch.device,
+    ) -> None:
+        self.model = model
+        self.device = device
+        self._network = network
+        self._calibration = calibration
+        self._preparation = cloud.PreparationConfig(**configuration["preparation"])
+        self._candidates = candidates.CandidateConfig(**configuration["candidates"])
+
+    @classmethod
+    def load(cls, path: Path, device: str = "cpu", num_threads: int | None = None) -> GraspPredictor:
+        """A predictor from a weights file.
+
+        Args:
+            path: a `.safetensors` file written by `python -m training fit`.
+            device: `cpu`, `cuda`, `cuda:1` ... or `auto`: the GPU when there is one.
+            num_threads: CPU threads of the whole process; None leaves torch's number.
+
+        Raises:
+            WeightsError: the file is missing, corrupted or does not fit its network.
+            DeviceError: this machine does not have the device.
+        """
+        chosen = _device(device)
+        if num_threads is not None:
+            torch.set_num_threads(num_threads)
+        state_dict, header = weights.load(path)
+        try:
+            network = networks.build(header.network, header.configuration["network"])
+            configuration = {
+                name: dict(header.configuration[name]) for name in ("network", "preparation", "candidates")
+            }
+            model = ModelInfo(
+                header.network, header.version, weights.sha256(path), header.training or {}, configuration
+            )
+            weights.verify(path, state_dict, {name: tensor.shape for name, tensor in network.state_dict().items()})
+            network.load_state_dict(state_dict)
+            return cls(network.to(chosen).eval(), configuration, header.calibration, model, chosen)
+        except (KeyError, TypeError, ValueError) as error:
+            why = f"its configuration does not build a network of this version ({error}); get matching weights"
+            raise WeightsError(path, why) from error
+
+    def warm_up(self) -> None:
+        """Answers one made-up query, so that the first real one is not slow."""
+        rng = np.random.default_rng(0)
+        square = rng.uniform(-0.05, 0.05, (4000, 2))
+        side = rng.choice([-1.0, 1.0], (4000, 1)) * 0.02
+        points = np.where(rng.random((4000, 1)) < 0.5, np.hstack([square, side]), np.hstack([side, square]))
+        self.predict(GraspQuery(points, viewpoints=np.array([0.3, 0.2, 0.6])))
+
+    @torch.inference_mode()
+    def predict(self, query: GraspQuery) -> GraspResult:
+        """Ranked grasps for a query, in the frame of its points. Equal queries have equal answers."""
+        clock = _Clock()
+        rejected = dict.fromkeys(REJECTIONS, 0)
+        notes = _query_warnings(query)
+
+        prepared = cloud.prepare(query, self._preparation, self.device)
+        self._synchronise()
+        clock.lap("prepare")
+        if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
+            count = 0 if prepared is None else len(prepared)
+            reason: Reason = "no_points_in_workspace" if prepared is None else "too_few_points"
+            return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
+        notes += _cloud_warnings(prepared, self._preparation)
+
+        found, dropped = candidates.generate(prepared, query, self._candidates)
+        rejected |= dropped
+        blocked = self._blocked(prepared, found, query)
+        free = found.select(~blocked)
+        rejected["collision"] = int(blocked.sum())
+        self._synchronise()
+        clock.lap("candidates")
+        sizes = (len(prepared), len(found), len(free))
+        if len(free) == 0:
+            reason = "all_in_collision" if len(found) else "no_candidates"
+            return _nothing(query, reason, sizes, rejected, notes, clock)
+
+        logits = self._network.score(self._network.encode(prepared), prepared, free)
+        a, b = self._calibration
+        scores = torch.sigmoid(a * logits + b)
+        self._synchronise()
+        clock.lap("network")
+
+        ranked = ranking.rank(
+            scores,
+            free.Ts_canonical_grasp,
+            max_grasps=query.max_grasps,
+            min_score=query.min_score,
+            separation_translation=query.separation_translation,
+            separation_rotation_deg=query.separation_rotation_deg,
+        )
+        rejected["min_score"], rejected["duplicates"] = ranked.below_min_score, ranked.duplicates
+        grasps = _grasps(prepared, free, scores, ranked.indices)
+        clock.lap("rank")
+        return GraspResult(
+            grasps=grasps,
+            counts=GraspCounts(len(query.points), *sizes, len(grasps), rejected),
+            reason=None if len(grasps) else "below_min_score",
+            warnings=tuple(notes),
+            timings_ms=clock.laps_ms,
+        )
+
+    def _blocked(self, prepared: cloud.PreparedCloud, found: candidates.Candidates, query: GraspQuery) -> torch.Tensor:
+        poses = found.Ts_canonical_grasp
+        blocked = collision.in_collision(prepared, poses, PANDA, PANDA.max_width, APPROACH_DISTANCE)
+        if query.unseen == "occupied":
+            blocked |= collision.in_shadow(prepared, poses, PANDA, PANDA.max_width)
+        return blocked
+
+    def _synchronise(self) -> None:
+        if self.device.type == "cuda":  # or a stage's work would be counted in a later one
+            torch.cuda.synchronize(self.device)
+
+
+class _Clock:
+    """Milliseconds between laps."""
+
+    def __init__(self) -> None:
+        self.laps_ms = dict.fromkeys(("prepare", "candidates", "network", "rank"), 0.0)
+        self._last = time.perf_counter()
+
+    def lap(self, name: str) -> None:
+        now = time.perf_counter()
+        self.laps_ms[name] = 1e3 * (now - self._last)
+        self._last = now
+
+
+def configuration_of(network_config: Any) -> dict[str, dict[str, Any]]:
+    """The configuration that a weights file's header carries, with today's preparation and candidates."""
+    return {
+        "network": asdict(network_config),
+        "preparation": asdict(cloud.PreparationConfig()),
+        "candidates": asdict(candidates.CandidateConfig()),
+    }
+
+
+def _device(name: str) -> torch.device:
+    if name == "auto":
+        return torch.device("cuda" if torch.cuda.is_available() else "cpu")
+    try:
+        device = torch.device(name)
+    except RuntimeError:
+        raise DeviceError(f"device {name!r} is unknown; choose auto, cpu or cuda") from None
+    if device.type not in ("cpu", "cuda"):
+        raise DeviceError(f"device {name!r} is not supported; choose auto, cpu or cuda")
+    if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
+        raise DeviceError(f"device {name!r}: torch sees {torch.cuda.device_count()} GPUs here; choose cpu or auto")
+    return device
+
+
+def _query_warnings(query: GraspQuery) -> list[str]:
+    notes = []
+    if query.viewpoints is None:
+        notes.append("viewpoint not given: the camera is taken to be at the origin of the cloud frame")
+    if query.up is None:
+        notes.append("up not given: grasps from below are not filtered, only those that come from behind what is seen")
+    return notes
+
+
+def _cloud_warnings(prepared: cloud.PreparedCloud, config: cloud.PreparationConfig) -> list[str]:
+    notes = []
+    if prepared.dropped_far:
+        notes.append(
+            f"{prepared.dropped_far} points farther than {config.max_extent:g} m from the cloud's median were ignored"
+        )
+    if prepared.dropped_surplus:
+        notes.append(
+            f"the cloud is large: {prepared.dropped_surplus} of its {config.voxel_size * 1000:g} mm cells, the "
+            f"farthest from its median, were ignored (limit {config.max_points}); set workspace to choose what matters"
+        )
+    return notes
+
+
+def _nothing(
+    query: GraspQuery,
+    reason: Reason,
+    sizes: tuple[int, int, int],
+    rejected: dict[str, int],
+    notes: list[str],
+    clock: _Clock,
+) -> GraspResult:
+    counts = GraspCounts(len(query.points), *sizes, 0, rejected)
+    return GraspResult(GraspSet.empty(), counts, reason, tuple(notes), clock.laps_ms)
+
+
+def _grasps(
+    prepared: cloud.PreparedCloud, free: candidates.Candidates, scores: torch.Tensor, indices: torch.Tensor
+) -> GraspSet:
+    """The candidates at the indices (M,), back in the frame of the query."""
+    chosen = free.select(indices.to(scores.device))
+    to_cloud = prepared.T_cloud_canonical
+    return GraspSet(
+        scores=scores[indices.to(scores.device)].cpu().double().numpy(),
+        Ts_cloud_grasp=to_cloud.matrix @ chosen.Ts_canonical_grasp.cpu().double().numpy(),
+        widths=np.full(len(indices), PANDA.max_width),
+        approach_points=to_cloud.apply(prepared.points[chosen.approach].cpu().numpy()),
+        contact_points=to_cloud.apply(prepared.points[chosen.contact].cpu().numpy()),
+    )

@@ -1,0 +1,162 @@
+"""What one asks of the predictor: a point cloud and the options of the wire, checked once at this edge. numpy only."""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+from typing import Literal
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from tesnet.errors import InvalidQuery
+
+MAX_GRASPS = 1000
+MAX_APPROACH_POINTS = 1024
+MAX_CANDIDATES = 20_000
+MAX_DIAGONAL = 20.0
+"""Metres; a cloud whose central 90 % spans more was not given in metres."""
+
+
+def _vector(field: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    try:
+        array = np.array(value, dtype=np.float64)
+    except (TypeError, ValueError):
+        raise InvalidQuery(field, "is no array of numbers; give x, y, z in metres") from None
+    if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
+        wanted = " x ".join("N" if size == -1 else str(size) for size in shape)
+        raise InvalidQuery(field, f"has shape {array.shape}; give an array of {wanted}")
+    if not np.isfinite(array).all():
+        raise InvalidQuery(field, "holds NaN or an infinity; every coordinate must be finite, remove such values")
+    array.setflags(write=False)
+    return array
+
+
+def _direction(field: str, value: ArrayLike) -> NDArray[np.float64]:
+    array = _vector(field, value, (3,))
+    length = float(np.linalg.norm(array))
+    if not 1e-6 < length < 1e6:
+        raise InvalidQuery(field, f"has length {length:g}; give a direction whose length is between 1e-6 and 1e6")
+    direction = array / length
+    direction.setflags(write=False)
+    return direction
+
+
+def _in_range(field: str, value: float, low: float, high: float, unit: str = "") -> None:
+    if not low <= value <= high:
+        raise InvalidQuery(field, f"is {value:g}; it must lie between {low:g} and {high:g}{unit}")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Box:
+    """Axis-aligned box in the cloud frame, metres.
+
+    Raises:
+        InvalidQuery: a minimum that is not below its maximum.
+    """
+
+    minimum: NDArray[np.float64]
+    maximum: NDArray[np.float64]
+
+    def __post_init__(self) -> None:
+        for name in ("minimum", "maximum"):
+            object.__setattr__(self, name, _vector("workspace", getattr(self, name), (3,)))
+        if not (self.minimum < self.maximum).all():
+            raise InvalidQuery(
+                "workspace", f"min {self.minimum.tolist()} is not below max {self.maximum.tolist()} on every axis"
+            )
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ApproachCone:
+    """Directions of travel that are wanted: within `max_angle_deg` of `direction` (cloud frame, made unit length)."""
+
+    direction: NDArray[np.float64]
+    max_angle_deg: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "direction", _direction("approach", self.direction))
+        _in_range("approach", self.max_angle_deg, 0, 180, " degrees")
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class GraspQuery:
+    """A point cloud and what is wanted of its grasps; the names and defaults are those of the HTTP interface.
+
+    Args:
+        points: (N, 3) metres; stored as float32.
+        viewpoints: (3,) or (V, 3) camera positions in the cloud frame; None is the origin.
+        up: (3,) direction against gravity, made unit length.
+        workspace: points outside are ignored.
+        support_height: height of the support plane along `up`, metres.
+        approach: cone of directions of travel.
+        max_grasps, min_score: how many to return, and the least score.
+        separation_translation, separation_rotation_deg: grasps nearer than both to a better one are dropped.
+        num_approach_points, max_candidates: search effort.
+        unseen: whether the shadow behind observed points counts as `free` or `occupied`.
+        seed: makes sampling repeatable.
+
+    Raises:
+        InvalidQuery: names the field and gives the value, the limit and the remedy.
+    """
+
+    points: NDArray[np.float32]
+    viewpoints: NDArray[np.float64] | None = None
+    up: NDArray[np.float64] | None = None
+    workspace: Box | None = None
+    support_height: float | None = None
+    approach: ApproachCone | None = None
+    max_grasps: int = 10
+    min_score: float = 0.0
+    separation_translation: float = 0.01
+    separation_rotation_deg: float = 15.0
+    num_approach_points: int = 32
+    max_candidates: int = 2000
+    unseen: Literal["free", "occupied"] = "free"
+    seed: int = 0
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "points", _cloud(self.points))
+        if self.viewpoints is not None:
+            array = np.asarray(self.viewpoints)
+            viewpoints = array[None] if array.ndim == 1 else array
+            object.__setattr__(self, "viewpoints", _vector("viewpoint", viewpoints, (-1, 3)))
+            if not 1 <= len(viewpoints) <= 64:
+                raise InvalidQuery("viewpoint", f"has {len(viewpoints)} positions; give 1 to 64")
+        if self.up is not None:
+            object.__setattr__(self, "up", _direction("up", self.up))
+        if self.support_height is not None:
+            if self.up is None:
+                raise InvalidQuery("support_height", "needs `up`: a height is measured along it; give `up` as well")
+            if not np.isfinite(self.support_height):
+                raise InvalidQuery("support_height", f"is {self.support_height}; give a finite height in metres")
+        _in_range("max_grasps", self.max_grasps, 1, MAX_GRASPS)
+        _in_range("min_score", self.min_score, 0, 1)
+        _in_range("min_separation", self.separation_translation, 0, 1, " m")
+        _in_range("min_separation", self.separation_rotation_deg, 0, 180, " degrees")
+        _in_range("num_approach_points", self.num_approach_points, 1, MAX_APPROACH_POINTS)
+        _in_range("max_candidates", self.max_candidates, 1, MAX_CANDIDATES)
+        _in_range("seed", self.seed, 0, 2**63 - 1)
+        if self.unseen not in ("free", "occupied"):
+            raise InvalidQuery("unseen", f"is {self.unseen!r}; valid: free, occupied")
+
+
+def _cloud(points: ArrayLike) -> NDArray[np.float32]:
+    array = np.array(points, dtype=np.float32)
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InvalidQuery("points", f"have shape {array.shape}; give an array of N x 3: x, y, z in metres")
+    if not np.isfinite(array).all():
+        bad = int((~np.isfinite(array).all(axis=1)).sum())
+        raise InvalidQuery(
+            "points", f"{bad} of {len(array)} are NaN or infinite; remove them (a camera marks missing depth so)"
+        )
+    if len(array):
+        low, high = np.percentile(array, [5, 95], axis=0)
+        diagonal = float(np.linalg.norm(high.astype(np.float64) - low))
+        if diagonal > MAX_DIAGONAL:
+            raise InvalidQuery(
+                "points",
+                f"span {diagonal:.0f} m (diagonal of the central 90 %; limit {MAX_DIAGONAL:g} m); "
+                "coordinates must be in metres: divide millimetres by 1000",
+            )
+    array.setflags(write=False)
+    return array
