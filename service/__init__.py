@@ -1,0 +1,1 @@
+"""The HTTP face of the grasp predictor: `python -m service`. Knows tesnet; nothing of training or simulation."""

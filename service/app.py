@@ -1,0 +1,134 @@
+"""`create_app`: routes and lifespan, nothing else."""
+
+from __future__ import annotations
+
+from collections.abc import AsyncIterator, Callable
+from contextlib import asynccontextmanager
+
+import anyio.to_thread
+import msgspec
+from fastapi import FastAPI, Request, Response
+from prometheus_client import CONTENT_TYPE_LATEST
+from starlette.exceptions import HTTPException
+
+from service import schemas
+from service.batching import PredictionWorker, PredictorFactory
+from service.errors import NotReady, ServiceError, problem_response
+from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
+from service.metrics import Metrics
+from service.middleware import RequestMiddleware
+from service.openapi import document_grasps, problems
+from service.payloads import DECODERS
+from service.settings import Settings, service_version
+from tesnet.errors import InvalidQuery
+from tesnet.geometry import FRAME_CONVENTIONS, HAND_TO_TCP, PANDA
+from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
+
+DESCRIPTION = """Point cloud in, ranked SE(3) grasps out. Lengths are metres; poses are in the frame of the request's
+points. In the default `panda` convention a grasp's origin is the TCP, +z is the direction of travel and +y the closing
+direction."""
+
+
+def create_app(
+    settings: Settings,
+    predictor_factory: PredictorFactory,
+    on_ready: Callable[[], None] = lambda: None,
+    on_failure: Callable[[BaseException], None] = lambda _: None,
+) -> FastAPI:
+    """The application, loading its predictor when its lifespan starts. `app.state.endpoint` is its `GraspEndpoint`.
+
+    Args:
+        settings: limits and defaults.
+        predictor_factory: makes the predictor, in the thread that will own it.
+        on_ready: called in that thread when requests are taken.
+        on_failure: called there with the exception when the predictor cannot be made.
+    """
+    metrics = Metrics()
+    worker = PredictionWorker(predictor_factory, settings.queue_size, metrics.batch, on_ready, on_failure)
+    endpoint = GraspEndpoint(settings, worker, metrics)
+    metrics.watch(queue_depth=lambda: worker.depth, is_ready=lambda: endpoint.ready)
+
+    @asynccontextmanager
+    async def lifespan(_: FastAPI) -> AsyncIterator[None]:
+        worker.start()
+        yield
+        await anyio.to_thread.run_sync(worker.stop)
+
+    app = FastAPI(
+        title="TES-Net grasp service",
+        version=service_version(),
+        description=DESCRIPTION,
+        lifespan=lifespan,
+        redoc_url=None,
+        redirect_slashes=False,
+    )
+    app.state.endpoint = endpoint
+    app.add_middleware(RequestMiddleware, metrics=metrics)
+    for kind in (ServiceError, InvalidQuery, HTTPException):
+        app.add_exception_handler(kind, _answer_problem)
+
+    @app.post(
+        "/grasps", tags=["grasps"], summary="Grasps for a point cloud", response_class=Response, include_in_schema=True
+    )
+    async def grasps(request: Request) -> Response:
+        return await endpoint.answer(request)
+
+    @app.get("/health/live", tags=["health"], summary="Does the process work?", responses=problems(NotReady))
+    async def live() -> schemas.Health:
+        if worker.state == "failed":
+            raise NotReady("The predictor could not be loaded; the log says why.", retry_after=60)
+        return schemas.Health(status="live")
+
+    @app.get("/health/ready", tags=["health"], summary="Does the service take requests?", responses=problems(NotReady))
+    async def ready() -> schemas.Health:
+        endpoint.check_ready()
+        return schemas.Health(status="ready")
+
+    @app.get("/model", tags=["model"], summary="Networks, frames and limits", responses=problems(NotReady))
+    async def model() -> schemas.ModelResponse:
+        return _describe(settings, worker)
+
+    @app.get("/metrics", tags=["health"], summary="Prometheus metrics", response_class=Response)
+    async def metrics_text() -> Response:
+        return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
+
+    document_grasps(app)
+    return app
+
+
+def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResponse:
+    info = worker.model
+    return schemas.ModelResponse(
+        models=[
+            schemas.NetworkOut(
+                name=info.name,
+                version=info.version,
+                weights_sha256=info.weights_sha256,
+                card=msgspec.to_builtins(info.card),
+                configuration=msgspec.to_builtins(info.configuration),
+            )
+        ],
+        gripper=schemas.GripperOut(
+            max_width=PANDA.max_width,
+            finger_depth=PANDA.finger_depth,
+            finger_thickness=PANDA.finger_thickness,
+            finger_breadth=PANDA.finger_breadth,
+            hand_to_tcp=HAND_TO_TCP,
+        ),
+        frame_conventions=list(FRAME_CONVENTIONS),
+        content_types=list(DECODERS),
+        limits=schemas.LimitsOut(
+            max_points=settings.max_points,
+            max_body_bytes=settings.max_body_bytes,
+            max_grasps=MAX_GRASPS,
+            max_approach_points=MAX_APPROACH_POINTS,
+            max_candidates=MAX_CANDIDATES,
+            queue_size=settings.queue_size,
+            max_timeout_s=MAX_TIMEOUT_S,
+        ),
+        device=worker.device,
+    )
+
+
+async def _answer_problem(request: Request, error: Exception) -> Response:
+    return problem_response(error, request.state.record.request_id)

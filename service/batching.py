@@ -1,0 +1,226 @@
+"""One worker thread that owns the predictor, behind a bounded queue. Knows neither HTTP nor the event loop.
+
+The predictor is made, warmed up and used in the worker's thread only. A request is a `concurrent.futures.Future`:
+whoever waits for it may cancel it while it is queued, and its place is free again at once.
+"""
+
+from __future__ import annotations
+
+import logging
+import threading
+import time
+from collections import deque
+from collections.abc import Callable
+from concurrent.futures import Future
+from dataclasses import dataclass, field
+from typing import TYPE_CHECKING, Literal, Protocol
+
+from service.errors import NotReady, QueueFull
+from tesnet.query import GraspQuery
+from tesnet.result import GraspResult
+
+if TYPE_CHECKING:  # importing it loads torch, which `--help` and a port in use need not wait for
+    from tesnet.predictor import ModelInfo
+
+log = logging.getLogger(__name__)
+
+State = Literal["loading", "ready", "failed", "stopped"]
+
+
+class Predictor(Protocol):
+    """What the service needs of `tesnet.predictor.GraspPredictor`."""
+
+    @property
+    def model(self) -> ModelInfo:
+        """Which network this is."""
+
+    @property
+    def device(self) -> object:
+        """Where it computes, as text."""
+
+    def warm_up(self) -> None:
+        """Predict once, so that the first request is not slow."""
+
+    def predict(self, query: GraspQuery) -> GraspResult:
+        """Grasps for a query."""
+
+
+PredictorFactory = Callable[[], Predictor]
+
+
+@dataclass(frozen=True, slots=True)
+class Answer:
+    """A prediction, and how long its query waited for the predictor."""
+
+    result: GraspResult
+    queue_ms: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Job:
+    """A query in the queue."""
+
+    query: GraspQuery
+    future: Future[Answer] = field(default_factory=Future)
+    submitted: float = field(default_factory=time.perf_counter)
+
+
+class PredictionWorker:
+    """A thread, its predictor and its queue.
+
+    Args:
+        factory: makes the predictor, in the worker's thread.
+        capacity: how many queries may wait.
+        on_batch: told the size of every batch that is predicted.
+        on_ready: told when queries are taken.
+        on_failure: told the exception when the predictor cannot be made; the worker's state is `failed` then.
+    """
+
+    def __init__(
+        self,
+        factory: PredictorFactory,
+        capacity: int,
+        on_batch: Callable[[int], None] = lambda _: None,
+        on_ready: Callable[[], None] = lambda: None,
+        on_failure: Callable[[BaseException], None] = lambda _: None,
+    ) -> None:
+        self._factory = factory
+        self._capacity = capacity
+        self._on_batch = on_batch
+        self._on_ready = on_ready
+        self._on_failure = on_failure
+        self._jobs: deque[Job] = deque()
+        self._changed = threading.Condition()
+        self._state: State = "loading"
+        self._model: ModelInfo | None = None
+        self._device = ""
+        self._seconds_per_job = 0.1
+        self._thread = threading.Thread(target=self._run, name="predictor", daemon=True)
+
+    @property
+    def state(self) -> State:
+        """Where the worker stands; queries are taken when it is `ready`."""
+        return self._state
+
+    @property
+    def model(self) -> ModelInfo:
+        """The loaded network.
+
+        Raises:
+            NotReady: while it is being loaded.
+        """
+        if self._model is None:
+            raise NotReady("The weights are being loaded; come back in a moment.", retry_after=1)
+        return self._model
+
+    @property
+    def device(self) -> str:
+        """Where the loaded network computes."""
+        return self._device
+
+    @property
+    def depth(self) -> int:
+        """Queries that wait."""
+        return len(self._jobs)
+
+    @property
+    def retry_after(self) -> int:
+        """Whole seconds after which a full queue should have room again."""
+        return max(1, min(60, round(self.depth * self._seconds_per_job)))
+
+    def start(self) -> None:
+        """Start loading."""
+        self._thread.start()
+
+    def stop(self) -> None:
+        """Finish what is being predicted, cancel what waits, end the thread."""
+        with self._changed:
+            self._state = "stopped"
+            waiting = list(self._jobs)
+            self._jobs.clear()
+            self._changed.notify()
+        for job in waiting:
+            job.future.cancel()
+        self._thread.join()
+
+    def check_ready(self) -> None:
+        """Whether queries are taken.
+
+        Raises:
+            NotReady: loading, failed or stopped.
+        """
+        if self._state != "ready":
+            raise NotReady(f"The predictor is {self._state}; come back in a moment.", retry_after=1)
+
+    def check_room(self) -> None:
+        """Whether one more query may wait: asked early, before a body is read, and again by `submit`.
+
+        Raises:
+            QueueFull: as many wait as may.
+        """
+        if len(self._jobs) >= self._capacity:
+            raise QueueFull(
+                f"{len(self._jobs)} requests wait (limit {self._capacity}); repeat this one in {self.retry_after} s.",
+                self.retry_after,
+            )
+
+    def submit(self, query: GraspQuery) -> Job:
+        """Queue a query; its future gives an `Answer`.
+
+        Raises:
+            QueueFull: as many wait as may.
+            NotReady: loading, failed or stopped.
+        """
+        with self._changed:
+            self.check_ready()
+            self.check_room()
+            job = Job(query)
+            self._jobs.append(job)
+            self._changed.notify()
+        return job
+
+    def cancel(self, job: Job) -> None:
+        """Nobody waits for the job any more: free its place. One that is being predicted runs to its end unheard."""
+        with self._changed:
+            if job.future.cancel() and job in self._jobs:
+                self._jobs.remove(job)
+
+    def _run(self) -> None:
+        try:
+            predictor = self._factory()
+            predictor.warm_up()
+            self._device = str(predictor.device)
+            self._model = predictor.model
+        except BaseException as error:  # noqa: BLE001 - told to the owner, whatever it is
+            self._state = "failed"
+            self._on_failure(error)
+            return
+        with self._changed:
+            if self._state == "loading":
+                self._state = "ready"
+                self._on_ready()
+        while batch := self._next_batch():
+            self._on_batch(len(batch))
+            for job in batch:
+                self._predict(predictor, job)
+
+    def _next_batch(self) -> list[Job]:
+        """The jobs to predict together, at present one; none when the worker is to end."""
+        with self._changed:
+            while True:
+                self._changed.wait_for(lambda: self._jobs or self._state == "stopped")
+                if self._state == "stopped":
+                    return []
+                job = self._jobs.popleft()
+                if job.future.set_running_or_notify_cancel():
+                    return [job]
+
+    def _predict(self, predictor: Predictor, job: Job) -> None:
+        started = time.perf_counter()
+        try:
+            result = predictor.predict(job.query)
+        except Exception as error:  # noqa: BLE001 - the waiting request raises it again
+            job.future.set_exception(error)
+        else:
+            job.future.set_result(Answer(result, 1e3 * (started - job.submitted)))
+        self._seconds_per_job += 0.2 * (time.perf_counter() - started - self._seconds_per_job)

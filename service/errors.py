@@ -1,0 +1,183 @@
+"""Exceptions -> `application/problem+json` (RFC 9457), in one table. Knows no routes.
+
+::
+
+    ServiceError
+    +-- Undecodable          the body is not what its content type says
+    +-- TooLarge             more bytes or points than the limits
+    +-- UnknownContentType   no decoder for the body
+    +-- NotAcceptable        no encoder for what the client accepts
+    +-- Invalid              decodes, but a value cannot be used; `field` names it
+    +-- QueueFull            come back after `retry_after` seconds
+    +-- NotReady             loading or draining; the same
+    +-- DeadlineExceeded     the client's deadline passed
+    +-- ClientGone           nobody is left to answer
+
+`tesnet.errors.InvalidQuery` has its row too. A detail states the value, the limit and the remedy; it never holds the
+cloud.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass
+from http import HTTPStatus
+
+import msgspec
+from starlette.exceptions import HTTPException
+from starlette.responses import Response
+
+from service.schemas import Problem
+from tesnet.errors import InvalidQuery
+
+PROBLEM_JSON = "application/problem+json"
+
+
+class ServiceError(Exception):
+    """Base class of what the service refuses a request for."""
+
+
+class Undecodable(ServiceError):
+    """The body is not what its content type says."""
+
+
+class TooLarge(ServiceError):
+    """More bytes or points than the configured limits."""
+
+
+class UnknownContentType(ServiceError):
+    """No decoder for the request's body."""
+
+
+class NotAcceptable(ServiceError):
+    """No encoder for what the client accepts."""
+
+
+class Invalid(ServiceError):
+    """A value that decodes but cannot be used.
+
+    Args:
+        field: the option or header, as on the wire.
+        message: the value, the limit and the remedy.
+    """
+
+    def __init__(self, field: str, message: str) -> None:
+        super().__init__(f"{field}: {message}")
+        self.field = field
+
+
+class _TryLater(ServiceError):
+    """The same request may succeed in `retry_after` seconds."""
+
+    def __init__(self, message: str, retry_after: int) -> None:
+        super().__init__(message)
+        self.retry_after = retry_after
+
+
+class QueueFull(_TryLater):
+    """As many requests wait as may."""
+
+
+class NotReady(_TryLater):
+    """The weights are being loaded, or the process is about to end."""
+
+
+class DeadlineExceeded(ServiceError):
+    """The request's deadline passed before the answer was there."""
+
+
+class ClientGone(ServiceError):
+    """The client closed the connection. Nobody reads the answer; the log has status 499."""
+
+
+@dataclass(frozen=True, slots=True)
+class Row:
+    """How a kind of exception is told to the client."""
+
+    status: int
+    slug: str
+    title: str
+    when: str
+
+
+PROBLEMS: Mapping[type[Exception], Row] = {
+    Undecodable: Row(
+        400, "undecodable-body", "The body cannot be decoded", "Empty or truncated body, broken JSON or .npy"
+    ),
+    NotAcceptable: Row(
+        406, "not-acceptable", "No such answer format", "`Accept` asks for a format this version does not write"
+    ),
+    TooLarge: Row(413, "too-large", "The request is too large", "More bytes or points than the configured limits"),
+    UnknownContentType: Row(
+        415, "unknown-content-type", "The content type is not supported", "Unknown `Content-Type` or `Content-Encoding`"
+    ),
+    Invalid: Row(
+        422,
+        "invalid-request",
+        "A value cannot be used",
+        "NaN, wrong shape, not metres, an option unknown or out of range",
+    ),
+    InvalidQuery: Row(
+        422,
+        "invalid-request",
+        "A value cannot be used",
+        "NaN, wrong shape, not metres, an option unknown or out of range",
+    ),
+    QueueFull: Row(
+        429, "queue-full", "The queue is full", "Too many requests wait; `Retry-After` says when to come back"
+    ),
+    NotReady: Row(
+        503, "not-ready", "The service is not ready", "Loading or draining; `Retry-After` says when to come back"
+    ),
+    DeadlineExceeded: Row(
+        504, "deadline-exceeded", "The deadline passed", "No answer within `X-Request-Timeout` seconds"
+    ),
+    ClientGone: Row(499, "client-gone", "The client closed the connection", "Seen in the log only"),
+}
+INTERNAL = Row(500, "internal-error", "The service failed", "A fault of the service, never of the body")
+
+
+def problem_response(error: Exception, request_id: str) -> Response:
+    """The problem document for an exception. What the table does not know is a 500 that tells no details."""
+    headers: dict[str, str] = {}
+    field: str | None = None
+    if isinstance(error, HTTPException):  # the router's 404 and 405
+        row = _http_row(error)
+        detail = _http_detail(error)
+        headers.update(error.headers or {})
+    else:
+        row = next((PROBLEMS[kind] for kind in type(error).__mro__ if kind in PROBLEMS), INTERNAL)
+        detail = str(error) if row is not INTERNAL else "The service's log has the reason under this request_id."
+        if isinstance(error, (Invalid, InvalidQuery)):
+            field = error.field
+        if isinstance(error, _TryLater):
+            headers["Retry-After"] = str(error.retry_after)
+    problem = Problem(
+        type=f"urn:tes-net:problem:{row.slug}",
+        title=row.title,
+        status=row.status,
+        detail=detail,
+        request_id=request_id,
+        field=field,
+    )
+    body = msgspec.json.encode(problem.model_dump(exclude_none=True))
+    return Response(body, row.status, headers, media_type=PROBLEM_JSON)
+
+
+def shortened(text: str, limit: int = 80) -> str:
+    """A value that a client sent, fit for a message: printable and short."""
+    printable = "".join(character if character.isprintable() else "?" for character in text[: limit + 1])
+    return printable if len(printable) <= limit else f"{printable[: limit - 3]}..."
+
+
+def _http_row(error: HTTPException) -> Row:
+    phrase = HTTPStatus(error.status_code).phrase
+    return Row(error.status_code, phrase.lower().replace(" ", "-"), phrase, phrase)
+
+
+def _http_detail(error: HTTPException) -> str:
+    if error.status_code == HTTPStatus.NOT_FOUND:
+        return "There is nothing at this path; /docs lists what there is."
+    if error.status_code == HTTPStatus.METHOD_NOT_ALLOWED:
+        return f"This path does not take this method; it takes {(error.headers or {}).get('Allow', 'another one')}."
+    return str(error.detail)

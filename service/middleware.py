@@ -1,0 +1,134 @@
+"""Around every request: its id, its log line, its count, and a decent end for bodies that nobody reads."""
+
+from __future__ import annotations
+
+import logging
+import re
+import time
+import uuid
+from dataclasses import dataclass, field
+from typing import Any
+
+import anyio
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.errors import problem_response
+from service.metrics import Metrics
+
+log = logging.getLogger("service.request")
+
+COUNTED_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
+"""Any other would be a label that a client makes up; Prometheus keeps a series for each."""
+
+LINGER_SECONDS = 5.0
+LINGER_BYTES = 128 * 2**20
+"""A client that still sends after its answer is heard so long: closing at once would destroy the answer on its way."""
+
+
+@dataclass(slots=True)
+class RequestRecord:
+    """What is known of a request while it is answered; routes add `fields` to its log line."""
+
+    request_id: str
+    arrived: float
+    fields: dict[str, Any] = field(default_factory=dict)
+    bytes_in: int = 0
+    asked_for_body: bool = False
+    body_complete: bool = False
+    status: int = 0
+
+
+class RequestMiddleware:
+    """Gives `scope["state"]["record"]`; answers what no handler caught as a 500.
+
+    Args:
+        app: the application inside.
+        metrics: counts requests.
+    """
+
+    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+        self._app = app
+        self._metrics = metrics
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        if scope["type"] != "http":
+            await self._app(scope, receive, send)
+            return
+        headers = Headers(scope=scope)
+        record = RequestRecord(request_id_of(headers.get("x-request-id")), time.perf_counter())
+        scope.setdefault("state", {})["record"] = record
+        record.body_complete = not _announces_body(headers)
+
+        async def receiving() -> Message:
+            record.asked_for_body = True
+            message = await receive()
+            if message["type"] == "http.request":
+                record.bytes_in += len(message.get("body", b""))
+                record.body_complete = not message.get("more_body", False)
+            return message
+
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                record.status = message["status"]
+                answer_headers = MutableHeaders(scope=message)
+                answer_headers["X-Request-ID"] = record.request_id
+                if not record.body_complete:
+                    answer_headers["Connection"] = "close"
+            elif not message.get("more_body", False) and not record.body_complete:
+                await send({**message, "more_body": True})
+                if record.asked_for_body or "expect" not in headers:
+                    await _linger(receiving, record)
+                message = {"type": "http.response.body", "body": b"", "more_body": False}
+            await send(message)
+
+        try:
+            await self._app(scope, receiving, sending)
+        except Exception as error:
+            log.exception("failed", extra={"fields": {"request_id": record.request_id}})
+            if record.status:
+                raise
+            await problem_response(error, record.request_id)(scope, receiving, sending)
+        finally:
+            self._finish(scope, record)
+
+    def _finish(self, scope: Scope, record: RequestRecord) -> None:
+        seconds = time.perf_counter() - record.arrived
+        route = getattr(scope.get("route"), "path", "other")
+        method = scope["method"] if scope["method"] in COUNTED_METHODS else "other"
+        self._metrics.request(method, route, record.status, seconds)
+        log.info(
+            "request",
+            extra={
+                "fields": {
+                    "request_id": record.request_id,
+                    "method": scope["method"],
+                    "path": scope["path"],
+                    "status": record.status,
+                    "duration_ms": round(1e3 * seconds, 3),
+                    "bytes_in": record.bytes_in,
+                    **record.fields,
+                }
+            },
+        )
+
+
+def request_id_of(given: str | None) -> str:
+    """The client's id where it is fit for a log (up to 128 letters, digits and . _ : / + = -), else a fresh one."""
+    if given and re.fullmatch(r"[A-Za-z0-9._:/+=-]{1,128}", given):
+        return given
+    return uuid.uuid4().hex
+
+
+def _announces_body(headers: Headers) -> bool:
+    return "transfer-encoding" in headers or headers.get("content-length", "0") != "0"
+
+
+async def _linger(receive: Receive, record: RequestRecord) -> None:
+    """Read and forget the rest of a body whose answer is on its way."""
+    limit = record.bytes_in + LINGER_BYTES
+    with anyio.move_on_after(LINGER_SECONDS):
+        while not record.body_complete and record.bytes_in < limit:
+            if (await receive())["type"] == "http.disconnect":
+                return

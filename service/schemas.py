@@ -1,0 +1,258 @@
+"""The wire format of the grasp service: the only source of it, and of its documentation at `/docs`.
+
+pydantic only: the client parses answers with these models, so neither torch nor FastAPI may be needed here.
+Positions and lengths are metres, in the frame of the request's points ("the cloud frame"), unless a name says
+otherwise.
+"""
+
+from __future__ import annotations
+
+from typing import Annotated, Literal
+
+from pydantic import BaseModel, ConfigDict, Field
+
+from tesnet.geometry import FrameConvention
+from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
+from tesnet.result import Reason
+
+MAX_VIEWPOINTS = 64
+
+Vector = tuple[float, float, float]
+Quaternion = tuple[float, float, float, float]
+MatrixRow = tuple[float, float, float, float]
+Matrix = tuple[MatrixRow, MatrixRow, MatrixRow, MatrixRow]
+
+
+class RequestPart(BaseModel):
+    """Part of a request: unknown names, strings in place of numbers, NaN and infinities are refused."""
+
+    model_config = ConfigDict(extra="forbid", strict=True, allow_inf_nan=False, frozen=True)
+
+
+class Box(RequestPart):
+    """Axis-aligned box in the cloud frame."""
+
+    min: Vector = Field(description="Lower corner x, y, z in metres.")
+    max: Vector = Field(description="Upper corner x, y, z in metres; above `min` on every axis.")
+
+
+class Approach(RequestPart):
+    """A cone of directions in which the hand may travel (the grasp's +z)."""
+
+    direction: Vector = Field(description="Axis of the cone in the cloud frame, of any length. Top-down is `-up`.")
+    max_angle_deg: float = Field(ge=0, le=180, description="Half angle of the cone in degrees, 0 to 180.")
+
+
+class Separation(RequestPart):
+    """How different two returned grasps must be; half a turn about the approach axis makes no difference."""
+
+    translation: float = Field(default=0.01, ge=0, le=1, description="Metres between the origins, 0 to 1.")
+    rotation_deg: float = Field(default=15.0, ge=0, le=180, description="Degrees between the orientations, 0 to 180.")
+
+
+class GraspOptions(RequestPart):
+    """Every option of `POST /grasps`, all optional, with the same names in a JSON body and in a query string."""
+
+    viewpoint: Vector | Annotated[list[Vector], Field(min_length=1, max_length=MAX_VIEWPOINTS)] | None = Field(
+        default=None,
+        description="Camera position [x, y, z] in the cloud frame, or a list of up to 64 of them for a fused cloud; "
+        "turns normals towards the camera. Default: the origin, and `warnings` says so.",
+    )
+    up: Vector | None = Field(
+        default=None,
+        description="Direction [x, y, z] against gravity in the cloud frame, of any length. Default: none, so grasps "
+        "from below are not filtered, and `warnings` says so.",
+    )
+    workspace: Box | None = Field(
+        default=None,
+        description='Box {"min": [x, y, z], "max": [x, y, z]} in metres; points outside are ignored. Default: none.',
+    )
+    support_height: float | None = Field(
+        default=None,
+        description="Height of the support plane along `up` in metres (needs `up`): points lower than 5 mm above it "
+        "are dropped, and the hand stays 4 mm clear of it. Default: none.",
+    )
+    approach: Approach | None = Field(
+        default=None,
+        description='Cone {"direction": [x, y, z], "max_angle_deg": 0 to 180} for the direction of travel. '
+        "Default: none.",
+    )
+    max_grasps: int = Field(
+        default=10, ge=1, le=MAX_GRASPS, description=f"How many grasps to return, 1 to {MAX_GRASPS}."
+    )
+    min_score: float = Field(default=0.0, ge=0, le=1, description="Least score of a returned grasp, 0 to 1.")
+    min_separation: Separation = Field(
+        default_factory=Separation,
+        description='Least difference {"translation": metres, "rotation_deg": degrees} between returned grasps; one '
+        "that is nearer than both to a better one is dropped.",
+    )
+    num_approach_points: int = Field(
+        default=32,
+        ge=1,
+        le=MAX_APPROACH_POINTS,
+        description=f"Search effort: approach points sampled, 1 to {MAX_APPROACH_POINTS}.",
+    )
+    max_candidates: int = Field(
+        default=2000, ge=1, le=MAX_CANDIDATES, description=f"Search effort: candidates scored, 1 to {MAX_CANDIDATES}."
+    )
+    unseen: Literal["free", "occupied"] = Field(
+        default="free",
+        description="What the collision check takes the shadow behind observed points for: free or occupied.",
+    )
+    pregrasp_distance: float = Field(
+        default=0.05, ge=0, le=1, description="How far behind the grasp `pregrasp` lies, metres, 0 to 1."
+    )
+    frame_convention: FrameConvention = Field(
+        default="panda",
+        description="Axes and origin of `position`, `quaternion_xyzw`, `matrix`: panda, graspnet or contact_graspnet.",
+    )
+    seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Makes sampling repeatable, 0 to 2^63 - 1.")
+    model: str = Field(default="tesnet", max_length=64, description="One of the networks that `GET /model` lists.")
+
+
+class GraspRequest(GraspOptions):
+    """Body of `POST /grasps` as `application/json`. `service.payloads` decodes the points, not this model."""
+
+    points: list[Vector] = Field(description="The point cloud: [[x, y, z], ...] in metres, finite.")
+
+
+class ResponsePart(BaseModel):
+    """Part of an answer. Later versions may add fields: readers ignore names they do not know."""
+
+    model_config = ConfigDict(extra="ignore", frozen=True)
+
+
+class PoseOut(ResponsePart):
+    """A pose in the cloud frame."""
+
+    position: Vector = Field(description="Origin x, y, z in metres.")
+    quaternion_xyzw: Quaternion = Field(description="Unit quaternion x, y, z, w.")
+
+
+class GraspOut(ResponsePart):
+    """One grasp, in the cloud frame. In the panda convention +z is the direction of travel, +y the closing one."""
+
+    score: float = Field(description="Probability from 0 to 1 that the grasp succeeds.")
+    position: Vector = Field(
+        description="Origin in metres: the TCP, midway between the finger pads (see frame_convention)."
+    )
+    quaternion_xyzw: Quaternion = Field(description="Unit quaternion x, y, z, w of the axes of frame_convention.")
+    matrix: Matrix = Field(description="The same pose as a 4 x 4 matrix T_cloud_grasp, row by row.")
+    hand_pose: PoseOut = Field(description="Pose of `panda_hand`, 0.1034 m behind the TCP; Panda axes always.")
+    pregrasp: PoseOut = Field(description="TCP pose `pregrasp_distance` behind the grasp; Panda axes always.")
+    width: float = Field(description="Opening to set before approaching, metres.")
+    approach_point: Vector = Field(description="Cloud point through which the hand's centre line passes, metres.")
+    contact_point: Vector = Field(description="Cloud point on which one fingertip closes, metres.")
+
+
+class ModelIdentity(ResponsePart):
+    """Which network scored the grasps."""
+
+    name: str = Field(description="Name of the network.")
+    version: str = Field(description="Version of its weights.")
+    weights_sha256: str = Field(description="SHA-256 of the weights file, in hexadecimal.")
+
+
+class RejectedOut(ResponsePart):
+    """Candidates dropped by each step, in the order of the steps."""
+
+    support: int = Field(description="The hand would come within 4 mm of the support plane.")
+    from_below: int = Field(description="The hand would come from below (needs `up`).")
+    approach: int = Field(description="The direction of travel is outside the `approach` cone.")
+    target: int = Field(description="Not on the target.")
+    collision: int = Field(description="The hand would collide with observed points.")
+    min_score: int = Field(description="Score below `min_score`.")
+    duplicates: int = Field(description="Too near a better grasp (`min_separation`).")
+
+
+class CountsOut(ResponsePart):
+    """The account of points and candidates: what each step left."""
+
+    points: int = Field(description="Points in the request.")
+    prepared_points: int = Field(description="Points left by crop, voxel grid and outlier removal.")
+    candidates: int = Field(description="Candidates found.")
+    collision_free: int = Field(description="Candidates whose hand does not collide.")
+    returned: int = Field(description="Grasps in this answer.")
+    rejected: RejectedOut
+
+
+class TimingsOut(ResponsePart):
+    """Milliseconds spent in each stage."""
+
+    decode: float = Field(description="Body to checked point cloud.")
+    queue: float = Field(description="Waiting for the predictor.")
+    prepare: float = Field(description="Crop, voxel grid, outliers, normals, neighbours.")
+    candidates: float = Field(description="Candidate grasps and their geometric masks.")
+    network: float = Field(description="Encoding the cloud and scoring candidates.")
+    rank: float = Field(description="Collision check, filters, ranking.")
+    total: float = Field(description="From the last byte of the request to the grasps.")
+
+
+class GraspResponse(ResponsePart):
+    """Answer of `POST /grasps`: grasps by score, best first."""
+
+    grasps: list[GraspOut] = Field(description="Best first; empty with a `reason` where nothing was found.")
+    frame: Literal["cloud"] = Field(description="Every pose is in the frame of the request's points.")
+    model: ModelIdentity
+    counts: CountsOut
+    reason: Reason | None = Field(description="Why `grasps` is empty; null when it is not.")
+    warnings: list[str] = Field(description="What the caller should know about the request.")
+    timings_ms: TimingsOut
+    request_id: str = Field(description="X-Request-ID of this request.")
+
+
+class Problem(ResponsePart):
+    """A problem document (RFC 9457), `application/problem+json`."""
+
+    type: str = Field(description="URN that names the kind of problem.")
+    title: str = Field(description="The kind of problem, in a few words.")
+    status: int = Field(description="The HTTP status.")
+    detail: str = Field(description="What was found, what is allowed, and what to do.")
+    request_id: str = Field(description="X-Request-ID of this request.")
+    field: str | None = Field(default=None, description="The option or header at fault, where there is one.")
+
+
+class Health(ResponsePart):
+    """State of the process."""
+
+    status: Literal["live", "ready"] = Field(description="`live`: the process works; `ready`: it takes requests.")
+
+
+class GripperOut(ResponsePart):
+    """The hand that collision checks and candidates assume, metres."""
+
+    max_width: float = Field(description="Largest opening between the finger pads.")
+    finger_depth: float = Field(description="Usable length of the fingers, measured back from the tips.")
+    finger_thickness: float = Field(description="Extent of one finger along the closing direction.")
+    finger_breadth: float = Field(description="Extent of one finger across the hand's plane.")
+    hand_to_tcp: float = Field(description="From `panda_hand` to the TCP, along z.")
+
+
+class LimitsOut(ResponsePart):
+    """What the service accepts."""
+
+    max_points: int = Field(description="Points in a request.")
+    max_body_bytes: int = Field(description="Bytes in a request's body.")
+    max_grasps: int = Field(description="Largest `max_grasps`.")
+    max_approach_points: int = Field(description="Largest `num_approach_points`.")
+    max_candidates: int = Field(description="Largest `max_candidates`.")
+    queue_size: int = Field(description="Requests that may wait for the predictor.")
+    max_timeout_s: float = Field(description="Largest X-Request-Timeout, seconds.")
+
+
+class NetworkOut(ModelIdentity):
+    """A loaded network."""
+
+    card: dict[str, object] = Field(description="How the weights came to be: data, seed, metrics.")
+    configuration: dict[str, object] = Field(description="Every number that travels with the weights.")
+
+
+class ModelResponse(ResponsePart):
+    """Answer of `GET /model`."""
+
+    models: list[NetworkOut] = Field(description="The loaded networks; the first is the default.")
+    gripper: GripperOut
+    frame_conventions: list[str] = Field(description="Valid values of `frame_convention`.")
+    content_types: list[str] = Field(description="Content types that `POST /grasps` decodes.")
+    limits: LimitsOut
+    device: str = Field(description="Compute device of the predictor.")

@@ -1,0 +1,150 @@
+"""Environment variables -> Settings. The environment is an argument: only `__main__` reads it."""
+
+from __future__ import annotations
+
+import difflib
+import os
+import re
+from collections.abc import Mapping
+from importlib.metadata import PackageNotFoundError, version
+from pathlib import Path
+from typing import Literal
+
+from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+
+PREFIX = "GRASP_"
+MAX_THREADS = 8
+"""More threads than this do not make one cloud of usual size any faster."""
+
+
+class InvalidSetting(Exception):
+    """An environment variable that cannot be used.
+
+    Args:
+        variable: its name.
+        why: the value and the remedy.
+    """
+
+    def __init__(self, variable: str, why: str) -> None:
+        super().__init__(f"{variable} {why}")
+        self.variable = variable
+
+
+def default_threads() -> int:
+    """Cores that this process may use, at most `MAX_THREADS`."""
+    cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
+    return min(cores, MAX_THREADS)
+
+
+class Settings(BaseModel):
+    """How the service runs. Every field is read from `GRASP_<FIELD>`, the name in capitals."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    host: str = Field(
+        default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for every interface."
+    )
+    port: int = Field(default=8000, ge=0, le=65535, description="TCP port, 0 to 65535; 0 picks a free one.")
+    models: Literal["tesnet"] = Field(default="tesnet", description="Networks to load; this version has tesnet.")
+    weights: Path | None = Field(
+        default=None, description="Weights file (.safetensors). Default: the one that is installed with the package."
+    )
+    device: str = Field(
+        default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="Compute device: auto, cpu, cuda or cuda:N."
+    )
+    num_threads: int = Field(
+        default_factory=default_threads,
+        ge=1,
+        le=1024,
+        description=f"CPU threads of the predictor. Default: the cores, at most {MAX_THREADS}.",
+    )
+    max_points: int = Field(
+        default=1_000_000, ge=1, le=100_000_000, description="Points in a request, 1 to 100,000,000."
+    )
+    max_body_mb: float = Field(
+        default=64.0, gt=0, le=4096, description="MiB in a request's body, more than 0, at most 4096."
+    )
+    queue_size: int = Field(
+        default=32, ge=1, le=10_000, description="Requests that may wait for the predictor, 1 to 10,000."
+    )
+    max_batch: Literal[1] = Field(
+        default=1, description="Clouds predicted together; this version predicts one at a time: 1."
+    )
+    request_timeout: float = Field(
+        default=30.0, gt=0, le=3600, description="Seconds to answer a request without X-Request-Timeout, at most 3600."
+    )
+    drain_timeout: float = Field(
+        default=30.0, ge=0, le=3600, description="Seconds to finish accepted requests after SIGTERM, 0 to 3600."
+    )
+    log_level: Literal["debug", "info", "warning", "error"] = Field(
+        default="info", description="Least level of a log line: debug, info, warning or error."
+    )
+
+    @field_validator("log_level", "device", "models", mode="before")
+    @classmethod
+    def _lower_case(cls, value: object) -> object:
+        return value.strip().lower() if isinstance(value, str) else value
+
+    @field_validator("max_batch", mode="before")
+    @classmethod
+    def _whole_number(cls, value: object) -> object:
+        return int(value) if isinstance(value, str) and re.fullmatch(r"\d{1,6}", value) else value
+
+    @property
+    def max_body_bytes(self) -> int:
+        """Bytes in a request's body."""
+        return int(self.max_body_mb * 2**20)
+
+
+REFUSED = {
+    "GRASP_API_KEYS": "this version knows no API keys and would answer everybody; unset it, and put a proxy in front"
+}
+
+
+def load_settings(environment: Mapping[str, str]) -> Settings:
+    """Settings of this process.
+
+    Raises:
+        InvalidSetting: names the variable, its value and the remedy.
+    """
+    for variable, why in REFUSED.items():
+        if environment.get(variable):
+            raise InvalidSetting(variable, f"is set, but {why}")
+    values = {
+        field: environment[variable]
+        for variable, field in variables().items()
+        if environment.get(variable, "") != ""  # an empty variable is how compose files and manifests say "default"
+    }
+    try:
+        return Settings.model_validate(values)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        field = str(first["loc"][0])
+        remedy = Settings.model_fields[field].description
+        hint = ""
+        if field == "port" and "://" in values[field]:
+            hint = (
+                " Kubernetes sets this variable for a Service named `grasp`: give the Service another name, or set "
+                "enableServiceLinks: false."
+            )
+        raise InvalidSetting(f"{PREFIX}{field.upper()}", f"is {values[field]!r}; expected: {remedy}{hint}") from None
+
+
+def variables() -> dict[str, str]:
+    """Names of the environment variables, each with its field."""
+    return {f"{PREFIX}{name.upper()}": name for name in Settings.model_fields}
+
+
+def unknown_variables(environment: Mapping[str, str]) -> dict[str, str | None]:
+    """`GRASP_*` variables that mean nothing, each with the closest known name."""
+    known = variables()
+    unknown = [name for name in environment if name.startswith(PREFIX) and name not in known and name not in REFUSED]
+    return {name: next(iter(difflib.get_close_matches(name, known, 1)), None) for name in sorted(unknown)}
+
+
+def service_version() -> str:
+    """Version of the installed package."""
+    try:
+        return version("tes-net")
+    except PackageNotFoundError:  # run from a checkout that was not installed
+        return "0+unknown"

@@ -1,0 +1,107 @@
+"""What tests of several packages share: the real service, in a process of its own."""
+
+from __future__ import annotations
+
+import json
+import os
+import queue
+import subprocess
+import sys
+import threading
+import time
+from collections.abc import Callable, Iterator, Mapping
+from contextlib import contextmanager
+from dataclasses import dataclass, field
+from typing import Any
+
+import pytest
+
+START_TIMEOUT_S = 300.0
+
+
+@dataclass
+class ServiceProcess:
+    """A `python -m service` on a free loopback port, and the log lines it has written."""
+
+    process: subprocess.Popen[str]
+    lines: list[dict[str, Any]] = field(default_factory=list)
+    arrived: queue.Queue[dict[str, Any] | None] = field(default_factory=queue.Queue)
+
+    def wait_for(self, event: str, **fields: Any) -> dict[str, Any]:
+        """The first log line of this event with these fields that was not waited for before."""
+        deadline = time.monotonic() + START_TIMEOUT_S
+        while True:
+            line = self.arrived.get(timeout=max(0.0, deadline - time.monotonic()))
+            if line is None:
+                errors = self.process.stderr.read() if self.process.stderr else ""
+                raise AssertionError(f"the service ended before {event!r}: {errors}\n{self.lines}")
+            if line["event"] == event and all(line.get(name) == value for name, value in fields.items()):
+                return line
+
+    @property
+    def url(self) -> str:
+        """Where it listens."""
+        return next(str(line["url"]) for line in self.lines if line["event"] == "listening")
+
+    def read(self) -> None:
+        assert self.process.stdout is not None
+        for text in self.process.stdout:
+            line = json.loads(text)
+            self.lines.append(line)
+            self.arrived.put(line)
+        self.arrived.put(None)
+
+
+StartService = Callable[..., Any]
+
+
+@contextmanager
+def running_service(command: list[str], environment: Mapping[str, str]) -> Iterator[ServiceProcess]:
+    process = subprocess.Popen(
+        command,
+        env={**os.environ, "GRASP_HOST": "127.0.0.1", "GRASP_PORT": "0", "GRASP_DEVICE": "cpu", **environment},
+        stdout=subprocess.PIPE,
+        stderr=subprocess.PIPE,
+        text=True,
+    )
+    service = ServiceProcess(process)
+    reader = threading.Thread(target=service.read, daemon=True)
+    reader.start()
+    try:
+        yield service
+    finally:
+        if process.poll() is None:
+            process.terminate()
+            try:
+                process.wait(30)
+            except subprocess.TimeoutExpired:
+                process.kill()
+                process.wait()
+        reader.join(10)
+        for stream in (process.stdout, process.stderr):
+            if stream is not None:
+                stream.close()
+
+
+@pytest.fixture(scope="session")
+def start_service() -> Callable[..., Any]:
+    """Start a `python -m service` of one's own: `with start_service(GRASP_QUEUE_SIZE="1") as service`."""
+
+    def start(**environment: str) -> Any:
+        return running_service([sys.executable, "-m", "service"], environment)
+
+    return start
+
+
+@pytest.fixture(scope="session")
+def shared_service(start_service: StartService) -> Iterator[ServiceProcess]:
+    """A real server with the shipped weights, ready, shared by all tests of the session."""
+    with start_service() as service:
+        service.wait_for("ready")
+        yield service
+
+
+@pytest.fixture(scope="session")
+def service_url(shared_service: ServiceProcess) -> str:
+    """URL of `shared_service`."""
+    return shared_service.url

@@ -1,0 +1,130 @@
+"""Decoders by themselves: what they give for every cloud, however it is cut into pieces."""
+
+from __future__ import annotations
+
+import json
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service import payloads
+from service.errors import Invalid, ServiceError, TooLarge
+from service.payloads import build_query, decode_json, parse_options, parse_query_string
+from tesnet.query import GraspQuery
+
+coordinates = st.floats(-10, 10, width=32) | st.integers(-10, 10)
+clouds = st.lists(st.tuples(coordinates, coordinates, coordinates), max_size=40)
+layouts = st.sampled_from([(",", ":"), (", ", ": "), (" ,\n\t", " :\r\n")])
+
+
+@given(clouds, layouts, st.integers(1, 60))
+def test_json_points_are_the_same_however_they_are_cut(
+    cloud: list[tuple[float, float, float]], layout: tuple[str, str], chunk: int
+) -> None:
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(payloads, "_CHUNK", chunk)
+        body = bytearray(json.dumps({"seed": 1, "points": cloud, "up": [0, 0, 1]}, separators=layout).encode())
+        payload = decode_json(body, 1000)
+    np.testing.assert_array_equal(payload.points, np.array(cloud, np.float32).reshape(-1, 3))
+    assert payload.points.dtype == np.float32
+    assert {name: json.loads(value) for name, value in payload.options.items()} == {"seed": 1, "up": [0, 0, 1]}
+
+
+anything: Any = st.recursive(
+    st.none() | st.booleans() | st.integers(-9, 9) | st.floats(-9, 9) | st.text('[]{},:"\\ a1', max_size=8),
+    lambda inner: st.lists(inner, max_size=4) | st.dictionaries(st.text("ab]", max_size=2), inner, max_size=3),
+    max_leaves=20,
+)
+
+
+@given(anything, st.integers(1, 20))
+def test_json_that_is_no_cloud_is_refused_however_it_is_cut(points: Any, chunk: int) -> None:
+    triples = isinstance(points, list) and all(
+        isinstance(point, list) and len(point) == 3 and all(type(value) in (int, float) for value in point)
+        for point in points
+    )
+    body = bytearray(json.dumps({"points": points}).encode())
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(payloads, "_CHUNK", chunk)
+        if triples:
+            assert len(decode_json(body, 1000).points) == len(points)
+        else:
+            with pytest.raises(Invalid, match=r"^points: "):
+                decode_json(body, 1000)
+
+
+@given(st.binary(max_size=200))
+def test_random_bytes_raise_nothing_but_what_the_table_of_problems_knows(body: bytes) -> None:
+    for decode in payloads.DECODERS.values():
+        for prefix in (b"", b'{"points": [[', b"\x93NUMPY\x01\x00", b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', "):
+            try:
+                payload = decode(bytearray(prefix + body), 1000)
+            except ServiceError:
+                continue
+            assert payload.points.shape[1:] == (3,)
+
+
+def test_a_bad_point_is_counted_from_the_start_of_the_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(payloads, "_CHUNK", 20)
+    points: list[Any] = [[0, 0, 1]] * 50
+    points[37] = [0, 0, None]
+    with pytest.raises(Invalid, match="point 37"):
+        decode_json(bytearray(json.dumps({"points": points}).encode()), 1000)
+
+
+def test_decoding_stops_at_the_first_point_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(payloads, "_CHUNK", 20)
+    body = bytearray(b'{"points": [' + b"[0,0,1]," * 100 + b"null]}")
+    with pytest.raises(TooLarge, match="limit"):
+        decode_json(body, 10)
+
+
+def test_the_last_of_equal_keys_counts_in_json_as_in_every_json_library() -> None:
+    payload = decode_json(bytearray(b'{"seed": 1, "points": [], "seed": 2}'), 10)
+    assert payload.options == {"seed": b"2"}
+
+
+def test_query_strings_hold_json_and_plain_words() -> None:
+    raw = parse_query_string(b"viewpoint=%5B0.3,0,0.6%5D&up=[0,+0,%201]&unseen=occupied&seed=7&&model=%22tesnet%22")
+    options = parse_options(raw)
+    assert options.viewpoint == (0.3, 0.0, 0.6)
+    assert options.up == (0.0, 0.0, 1.0)
+    assert (options.unseen, options.seed, options.model) == ("occupied", 7, "tesnet")
+
+
+def test_options_arrive_in_the_query_and_defaults_are_the_library_s_own() -> None:
+    points = np.zeros((4, 3), np.float32)
+    default, library = build_query(points, parse_options({})), GraspQuery(points)
+    for name in GraspQuery.__slots__:
+        if name != "points":
+            assert getattr(default, name) == getattr(library, name), name
+
+    raw = {
+        "viewpoint": b"[[0, 0, 1], [1, 0, 1]]",
+        "up": b"[0, 0, 2]",
+        "workspace": b'{"min": [0, 0, 0], "max": [1, 2, 3]}',
+        "support_height": b"0.25",
+        "approach": b'{"direction": [0, 0, -1], "max_angle_deg": 30}',
+        "max_grasps": b"3",
+        "min_score": b"0.5",
+        "min_separation": b'{"rotation_deg": 40}',
+        "num_approach_points": b"8",
+        "max_candidates": b"99",
+        "unseen": b'"occupied"',
+        "seed": b"5",
+    }
+    query = build_query(points, parse_options(raw))
+    assert query.viewpoints is not None
+    assert query.viewpoints.tolist() == [[0, 0, 1], [1, 0, 1]]
+    assert query.up is not None
+    assert query.up.tolist() == [0, 0, 1]
+    assert query.workspace is not None
+    assert query.workspace.maximum.tolist() == [1, 2, 3]
+    assert query.approach is not None
+    assert query.approach.max_angle_deg == 30
+    assert (query.support_height, query.max_grasps, query.min_score) == (0.25, 3, 0.5)
+    assert (query.separation_translation, query.separation_rotation_deg) == (0.01, 40)
+    assert (query.num_approach_points, query.max_candidates, query.unseen, query.seed) == (8, 99, "occupied", 5)

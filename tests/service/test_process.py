@@ -1,0 +1,155 @@
+"""`python -m service` as an operator meets it: exit codes, messages, signals."""
+
+from __future__ import annotations
+
+import os
+import signal
+import socket
+import subprocess
+import sys
+import urllib.parse
+from collections.abc import Callable
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from tesnet.weights import SUMS, default_weights
+
+StartService = Callable[..., Any]
+
+POINTS = np.zeros((20, 3), np.float32).tobytes()
+
+
+def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]:
+    """A service that is expected to end by itself."""
+    return subprocess.run(
+        [sys.executable, "-m", "service", *arguments],
+        env={**os.environ, "GRASP_HOST": "127.0.0.1", "GRASP_PORT": "0", "GRASP_DEVICE": "cpu", **environment},
+        capture_output=True,
+        text=True,
+        timeout=300,
+        check=False,
+    )
+
+
+def half_a_request(url: str) -> socket.socket:
+    """A connection on which a request was begun that the service now waits for."""
+    parts = urllib.parse.urlsplit(url)
+    connection = socket.create_connection((parts.hostname or "", parts.port or 0), timeout=60)
+    connection.sendall(
+        f"POST /grasps HTTP/1.1\r\nHost: test\r\nContent-Type: application/octet-stream\r\n"
+        f"Content-Length: {len(POINTS)}\r\nExpect: 100-continue\r\n\r\n".encode()
+    )
+    assert connection.recv(4096).startswith(b"HTTP/1.1 100 ")  # the service has begun to read the body
+    return connection
+
+
+def test_sigterm_refuses_what_is_new_finishes_what_was_taken_and_exits_with_0(start_service: StartService) -> None:
+    with start_service() as service:
+        service.wait_for("ready")
+        with half_a_request(service.url) as connection:
+            service.process.send_signal(signal.SIGTERM)
+            service.wait_for("draining")
+            assert httpx.get(f"{service.url}/health/ready").status_code == 503
+            assert httpx.get(f"{service.url}/health/live").status_code == 200
+            refused = httpx.post(f"{service.url}/grasps", json={"points": []})
+            assert (refused.status_code, refused.headers["Retry-After"]) == (503, "1")
+            connection.sendall(POINTS)
+            assert connection.recv(4096).startswith(b"HTTP/1.1 200 ")
+        assert service.process.wait(30) == 0
+        service.wait_for("stopped")
+        assert service.process.stderr.read() == ""
+
+
+def test_a_second_sigterm_ends_at_once(start_service: StartService) -> None:
+    with start_service() as service:
+        service.wait_for("ready")
+        with half_a_request(service.url):
+            service.process.send_signal(signal.SIGTERM)
+            service.wait_for("draining")
+            service.process.send_signal(signal.SIGTERM)
+            assert service.process.wait(30) == 128 + signal.SIGTERM
+        assert not any(line["event"] == "stopped" for line in service.lines)
+
+
+def test_the_drain_timeout_ends_a_request_that_never_ends(start_service: StartService) -> None:
+    with start_service(GRASP_DRAIN_TIMEOUT="0.2") as service:
+        service.wait_for("ready")
+        with half_a_request(service.url):
+            service.process.send_signal(signal.SIGINT)
+            assert service.process.wait(60) == 0
+
+
+def test_port_0_picks_a_free_port_and_the_log_tells_it(shared_service: Any) -> None:
+    ready = next(line for line in shared_service.lines if line["event"] == "ready")
+    assert ready["port"] > 0
+    assert ready["url"] == f"http://127.0.0.1:{ready['port']}"
+    assert ready["pid"] == shared_service.process.pid
+    assert httpx.get(f"{ready['url']}/health/ready").status_code == 200
+
+
+def test_missing_weights_end_it_with_the_path_and_an_unknown_setting_is_warned_of(tmp_path: Path) -> None:
+    ended = run(GRASP_WEIGHTS=str(tmp_path / "none.safetensors"), GRASP_QUEUE_SISE="3")
+    assert ended.returncode == 1
+    assert str(tmp_path / "none.safetensors") in ended.stderr
+    assert "did you mean GRASP_QUEUE_SIZE?" in ended.stdout
+    assert "Traceback" not in ended.stderr + ended.stdout
+
+
+@pytest.mark.parametrize("damage", ["a flipped bit", "cut off", "another file"])
+def test_corrupted_weights_end_it_with_the_path_and_the_reason(tmp_path: Path, damage: str) -> None:
+    weights = default_weights()
+    content = bytearray(weights.read_bytes())
+    if damage == "a flipped bit":
+        content[-100] ^= 1
+    elif damage == "cut off":
+        del content[len(content) // 2 :]
+    else:
+        content = bytearray(b"no weights at all")
+    (tmp_path / SUMS).write_bytes(weights.with_name(SUMS).read_bytes())
+    damaged = tmp_path / weights.name
+    damaged.write_bytes(content)
+
+    ended = run(GRASP_WEIGHTS=str(damaged))
+
+    assert ended.returncode == 1
+    assert str(damaged) in ended.stderr
+    assert "Traceback" not in ended.stderr + ended.stdout
+
+
+def test_a_port_in_use_ends_it_before_anything_is_loaded() -> None:
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        port = taken.getsockname()[1]
+        ended = run(GRASP_PORT=str(port))
+    assert ended.returncode == 2
+    assert "GRASP_PORT" in ended.stderr
+    assert str(port) in ended.stderr
+    assert "another process" in ended.stderr
+    assert ended.stdout == ""
+
+
+def test_a_host_that_is_not_ours_ends_it() -> None:
+    ended = run(GRASP_HOST="192.0.2.1")
+    assert ended.returncode == 2
+    assert "GRASP_HOST" in ended.stderr
+    assert "127.0.0.1" in ended.stderr
+
+
+def test_an_invalid_setting_ends_it_with_variable_value_and_remedy() -> None:
+    ended = run(GRASP_QUEUE_SIZE="none")
+    assert ended.returncode == 2
+    for word in ("GRASP_QUEUE_SIZE", "'none'", "10,000"):
+        assert word in ended.stderr
+    assert ended.stdout == ""
+
+
+def test_help_names_every_setting_and_version_is_told() -> None:
+    helped = run("--help")
+    assert helped.returncode == 0
+    for name in ("GRASP_PORT", "GRASP_WEIGHTS", "GRASP_DEVICE", "GRASP_NUM_THREADS", "SIGTERM"):
+        assert name in helped.stdout
+    assert run("--version").stdout.startswith("tes-net ")
+    assert run("--what").returncode == 2

@@ -1,0 +1,69 @@
+from __future__ import annotations
+
+import os
+from pathlib import Path
+
+import pytest
+
+from service.settings import InvalidSetting, load_settings, unknown_variables
+
+
+def test_an_empty_environment_gives_the_documented_defaults() -> None:
+    settings = load_settings({})
+    assert (settings.host, settings.port, settings.device) == ("127.0.0.1", 8000, "auto")
+    assert (settings.max_points, settings.max_body_bytes) == (1_000_000, 64 * 2**20)
+    assert settings.request_timeout == 30
+    assert 1 <= settings.num_threads <= (os.cpu_count() or 1)
+
+
+def test_every_value_is_text_and_an_empty_one_means_the_default() -> None:
+    settings = load_settings(
+        {
+            "GRASP_PORT": "0",
+            "GRASP_WEIGHTS": "/models/a.safetensors",
+            "GRASP_DEVICE": "CUDA:1",
+            "GRASP_NUM_THREADS": "",
+            "GRASP_MAX_BODY_MB": "0.5",
+            "GRASP_MAX_BATCH": "1",
+            "OTHER": "x",
+        }
+    )
+    assert (settings.port, settings.weights, settings.device) == (0, Path("/models/a.safetensors"), "cuda:1")
+    assert settings.max_body_bytes == 2**19
+
+
+@pytest.mark.parametrize(
+    ("variable", "value", "word"),
+    [
+        ("GRASP_PORT", "65536", "65535"),
+        ("GRASP_PORT", "http", "free"),
+        ("GRASP_PORT", "tcp://10.0.0.1:8000", "Kubernetes"),
+        ("GRASP_DEVICE", "gpu", "cuda"),
+        ("GRASP_NUM_THREADS", "0", "cores"),
+        ("GRASP_MAX_POINTS", "-1", "100,000,000"),
+        ("GRASP_MAX_BODY_MB", "nan", "4096"),
+        ("GRASP_QUEUE_SIZE", "2.5", "10,000"),
+        ("GRASP_MAX_BATCH", "8", "one at a time"),
+        ("GRASP_MODELS", "tesnet,gpd", "tesnet"),
+        ("GRASP_REQUEST_TIMEOUT", "0", "3600"),
+        ("GRASP_DRAIN_TIMEOUT", "inf", "3600"),
+        ("GRASP_LOG_LEVEL", "loud", "debug"),
+    ],
+)
+def test_an_invalid_value_names_variable_value_and_remedy(variable: str, value: str, word: str) -> None:
+    with pytest.raises(InvalidSetting) as refused:
+        load_settings({variable: value})
+    assert refused.value.variable == variable
+    assert str(refused.value).startswith(f"{variable} is {value!r}; expected: ")
+    assert word in str(refused.value)
+
+
+def test_api_keys_are_refused_rather_than_ignored() -> None:
+    with pytest.raises(InvalidSetting, match="GRASP_API_KEYS"):
+        load_settings({"GRASP_API_KEYS": "secret"})
+    assert load_settings({"GRASP_API_KEYS": ""}) == load_settings({})
+
+
+def test_unknown_variables_come_with_the_closest_known_name() -> None:
+    found = unknown_variables({"GRASP_MAX_POINT": "1", "GRASP_PORT": "1", "GRASP_ZZZZZZZZZ": "1", "PATH": "/"})
+    assert found == {"GRASP_MAX_POINT": "GRASP_MAX_POINTS", "GRASP_ZZZZZZZZZ": None}
