@@ -1,0 +1,185 @@
+"""`python -m client cloud.ply`: grasps of a cloud file, as a table or as the service's JSON.
+
+Exit codes: 0 grasps found; 1 none found, and the reason is printed; 2 wrong usage, an unreadable file, or input that
+the service refuses (4xx); 3 the service cannot be reached, is overloaded or fails.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+from numpy.typing import NDArray
+
+from client.cloud_file import READERS, CloudFileError, decode_cloud, read_cloud, read_npy
+from client.errors import GraspClientError, InvalidArgument, Overloaded, ProblemError
+from client.reply import GraspReply
+from client.request import GraspOptions
+from client.session import DEFAULT_TIMEOUT, GraspClient
+from tesnet.geometry import FRAME_CONVENTIONS
+
+DEFAULT_URL = "http://127.0.0.1:8000"
+
+FOUND, NOTHING_FOUND, BAD_INPUT, SERVICE_ERROR = range(4)
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Run the command; returns the exit code."""
+    parser = _parser()
+    chosen = parser.parse_args(arguments)
+    if chosen.support_height is not None and chosen.up is None:
+        parser.error("--support-height is measured along `up`; give --up as well, for instance --up 0 0 1")
+    try:
+        points = _points(chosen.cloud)
+        with GraspClient(chosen.url, timeout=chosen.timeout) as client:
+            reply = client.grasps(points, request_id=chosen.request_id, **_options(chosen))
+    except (CloudFileError, GraspClientError) as error:
+        print(f"{parser.prog}: {error}", file=sys.stderr)
+        return _exit_code(error)
+    _show(reply, as_json=chosen.json)
+    return FOUND if reply.grasps else NOTHING_FOUND
+
+
+def table(reply: GraspReply) -> str:
+    """The grasps of a reply, aligned, best first: rank, score, position (m), quaternion (x, y, z, w) and width (m)."""
+    rows: list[tuple[str, ...]] = [("rank", "score", "x", "y", "z", "qx", "qy", "qz", "qw", "width")]
+    for rank, grasp in enumerate(reply.grasps, start=1):
+        numbers = [*grasp.position, *grasp.quaternion_xyzw, grasp.width]
+        rows.append((str(rank), f"{grasp.score:.3f}", *(f"{number:.4f}" for number in numbers)))
+    widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
+    return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+
+
+def _points(cloud: str) -> NDArray[Any]:
+    return decode_cloud(sys.stdin.buffer.read(), read_npy, "stdin") if cloud == "-" else read_cloud(Path(cloud))
+
+
+def _show(reply: GraspReply, *, as_json: bool) -> None:
+    if as_json:
+        print(reply.text)
+    elif reply.grasps:
+        print(table(reply))
+    else:
+        print(f"no grasps: {reply.reason}")
+    for warning in reply.warnings:
+        print(f"warning: {warning}", file=sys.stderr)
+
+
+def _exit_code(error: CloudFileError | GraspClientError) -> int:
+    if isinstance(error, CloudFileError | InvalidArgument):
+        return BAD_INPUT
+    refused = isinstance(error, ProblemError) and error.status < 500 and not isinstance(error, Overloaded)
+    return BAD_INPUT if refused else SERVICE_ERROR
+
+
+def _options(chosen: argparse.Namespace) -> GraspOptions:
+    """The options given on the command line; those left out stay the service's."""
+    options: GraspOptions = {}
+    if chosen.viewpoint is not None:
+        options["viewpoint"] = chosen.viewpoint[0] if len(chosen.viewpoint) == 1 else chosen.viewpoint
+    if chosen.workspace is not None:
+        options["workspace"] = {"min": chosen.workspace[:3], "max": chosen.workspace[3:]}
+    if chosen.approach is not None:
+        options["approach"] = {"direction": chosen.approach[:3], "max_angle_deg": chosen.approach[3]}
+    if chosen.min_separation is not None:
+        options["min_separation"] = {"translation": chosen.min_separation[0], "rotation_deg": chosen.min_separation[1]}
+    for name in _PLAIN_OPTIONS:
+        value = getattr(chosen, name)
+        if value is not None:
+            options[name] = value  # type: ignore[literal-required]
+    return options
+
+
+_PLAIN_OPTIONS = (
+    "up",
+    "support_height",
+    "max_grasps",
+    "min_score",
+    "num_approach_points",
+    "max_candidates",
+    "unseen",
+    "pregrasp_distance",
+    "frame_convention",
+    "seed",
+    "model",
+)
+"""Options whose flag's value is the wire's value."""
+
+
+def _number(text: str) -> float:
+    value = float(text)
+    if not np.isfinite(value):
+        raise argparse.ArgumentTypeError(f"{text} is not finite")
+    return value
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m client",
+        description="Ask the grasp service for grasps of a point cloud. Lengths are metres, in the frame of the cloud.",
+        epilog="Exit codes: 0 grasps found; 1 none found; 2 wrong usage or input; 3 no service, or it failed. "
+        "Options left out get the service's defaults.",
+    )
+    add = parser.add_argument
+    add("cloud", help=f"file ({', '.join(READERS)}), or - for a .npy array on stdin")
+    add(
+        "--url",
+        default=os.environ.get("GRASP_URL") or DEFAULT_URL,
+        help="the service (default: $GRASP_URL, or %(default)s)",
+    )
+    add("--json", action="store_true", help="print the service's JSON instead of a table")
+    add("--timeout", type=_number, default=DEFAULT_TIMEOUT, metavar="S", help="seconds in all (default: %(default)g)")
+    add("--request-id", metavar="ID", help="names the request in the service's log")
+    wire = parser.add_argument_group("options of the request")
+    add = wire.add_argument
+    vector = ("X", "Y", "Z")
+    add("--top-k", "--max-grasps", dest="max_grasps", type=int, metavar="K", help="how many grasps to return")
+    add(
+        "--viewpoint",
+        type=_number,
+        nargs=3,
+        metavar=vector,
+        action="append",
+        help="camera position; repeat it for a fused cloud",
+    )
+    add("--up", type=_number, nargs=3, metavar=vector, help="direction against gravity")
+    add("--support-height", type=_number, metavar="H", help="height of the support plane along --up")
+    add(
+        "--workspace",
+        type=_number,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="box; points outside are ignored",
+    )
+    add(
+        "--approach",
+        type=_number,
+        nargs=4,
+        metavar=(*vector, "DEG"),
+        help="direction of travel and how far from it the hand may come",
+    )
+    add("--min-score", type=_number, metavar="P", help="least score of a returned grasp")
+    add(
+        "--min-separation",
+        type=_number,
+        nargs=2,
+        metavar=("M", "DEG"),
+        help="grasps nearer than both to a better one are dropped",
+    )
+    add("--num-approach-points", type=int, metavar="N", help="search effort")
+    add("--max-candidates", type=int, metavar="N", help="search effort")
+    add("--unseen", choices=("free", "occupied"), help="the shadow behind observed points, for collisions")
+    add("--pregrasp-distance", type=_number, metavar="M", help="how far behind the grasp the pregrasp lies")
+    add("--frame-convention", choices=FRAME_CONVENTIONS, help="axes and origin of the printed poses")
+    add("--seed", type=int, metavar="N", help="makes sampling repeatable")
+    add("--model", metavar="NAME", help="one of the loaded networks")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

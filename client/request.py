@@ -1,0 +1,191 @@
+"""A caller's arguments -> one HTTP request, as pure functions. Knows the wire, but no HTTP library and no connection.
+
+Points travel as little-endian float32 triples; the options stand in the query string, each value as URL-encoded JSON.
+"""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Mapping, Sequence
+from dataclasses import dataclass, field
+from types import MappingProxyType
+from typing import TYPE_CHECKING, Any, Literal, TypeAlias, TypedDict
+from urllib.parse import quote, urlencode
+
+import numpy as np
+from numpy.typing import ArrayLike, NDArray
+
+from client.errors import InvalidArgument
+
+if TYPE_CHECKING:
+    from tesnet.geometry import FrameConvention
+
+Vector: TypeAlias = Sequence[float] | NDArray[Any]
+"""x, y, z in the frame of the points."""
+
+
+class Box(TypedDict):
+    """Axis-aligned box in the cloud frame, metres."""
+
+    min: Vector
+    max: Vector
+
+
+class ApproachCone(TypedDict):
+    """Directions of travel (+z of the grasp) that are wanted. Top-down is `-up`."""
+
+    direction: Vector
+    max_angle_deg: float
+
+
+class Separation(TypedDict, total=False):
+    """Grasps nearer than both to a better one are dropped."""
+
+    translation: float
+    rotation_deg: float
+
+
+class GraspOptions(TypedDict, total=False):
+    """Options of a grasp request, named as on the wire; what is left out or None gets the service's default.
+
+    Positions and directions are in the frame of the points; lengths are in metres.
+
+    Args:
+        viewpoint: camera position, or a list of positions for a fused cloud; orients normals. Default: the origin, and
+            a warning says so.
+        up: direction against gravity. Without it grasps from below are not filtered, and a warning says so.
+        workspace: `{"min": ..., "max": ...}`; points outside are ignored.
+        support_height: height of the support plane along `up` (needs `up`).
+        approach: `{"direction": ..., "max_angle_deg": ...}`.
+        max_grasps: how many to return (default 10).
+        min_score: threshold (default 0).
+        min_separation: `{"translation": 0.01, "rotation_deg": 15}`.
+        num_approach_points: search effort (default 32).
+        max_candidates: search effort (default 2000).
+        unseen: whether the shadow behind observed points is `"free"` (default) or `"occupied"` for collisions.
+        pregrasp_distance: how far behind the grasp `pregrasp` lies (default 0.05).
+        frame_convention: `"panda"` (default), `"graspnet"` or `"contact_graspnet"`.
+        seed: makes sampling repeatable (default 0).
+        model: one of the networks that the service has loaded (default `"tesnet"`).
+    """
+
+    viewpoint: Vector | Sequence[Vector]
+    up: Vector
+    workspace: Box
+    support_height: float
+    approach: ApproachCone
+    max_grasps: int
+    min_score: float
+    min_separation: Separation
+    num_approach_points: int
+    max_candidates: int
+    unseen: Literal["free", "occupied"]
+    pregrasp_distance: float
+    frame_convention: FrameConvention
+    seed: int
+    model: str
+
+
+@dataclass(frozen=True, slots=True)
+class Request:
+    """One HTTP request, ready to be sent any number of times.
+
+    Args:
+        method: GET or POST.
+        target: path and query string, beginning with a slash.
+        content: the body.
+        headers: all but those of the connection itself.
+    """
+
+    method: str
+    target: str
+    content: bytes = b""
+    headers: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
+
+
+def points_request(points: ArrayLike, options: Mapping[str, Any], request_id: str | None = None) -> Request:
+    """The request for grasps of points (N, 3), metres.
+
+    Raises:
+        InvalidArgument: points that cannot be sent (`checked_points`), or an option that JSON cannot express.
+        TypeError: an option of another name than those of `GraspOptions`.
+    """
+    cloud = checked_points(points)
+    values = _options(options)
+    texts = {name: json.dumps(value, separators=(",", ":")) for name, value in values.items()}
+    query = urlencode(texts, quote_via=quote)
+    headers = {"Content-Type": "application/octet-stream", **_headers(request_id)}
+    return Request(
+        "POST", f"/grasps?{query}" if query else "/grasps", cloud.astype("<f4", copy=False).tobytes(), headers
+    )
+
+
+def checked_points(points: ArrayLike) -> NDArray[np.float32]:
+    """Points (N, 3), metres, as the float32 array that is sent.
+
+    Raises:
+        InvalidArgument: not an array of real numbers, another shape, no point at all, or a coordinate that is NaN,
+            infinite or beyond float32.
+    """
+    try:
+        array = np.asarray(points)
+    except ValueError:
+        raise InvalidArgument(
+            "points", "have rows of different lengths; give an array of N x 3: x, y, z in metres"
+        ) from None
+    if array.dtype.kind not in "fiu":
+        raise InvalidArgument("points", f"have dtype {array.dtype}; give real numbers: float32 or float64 metres")
+    if array.ndim != 2 or array.shape[1] != 3:
+        raise InvalidArgument("points", f"have shape {array.shape}; give an array of N x 3: x, y, z in metres")
+    if not len(array):
+        raise InvalidArgument("points", "have 0 rows; give at least 1 point (was the whole cloud cropped away?)")
+    with np.errstate(over="ignore"):  # a coordinate beyond float32 becomes infinite and is reported below
+        cloud = np.ascontiguousarray(array, dtype=np.float32)
+    bad = int((~np.isfinite(cloud).all(axis=1)).sum())
+    if bad:
+        raise InvalidArgument(
+            "points",
+            f"{bad} of {len(cloud)} are NaN, infinite or beyond float32; remove them (a camera marks missing depth so)",
+        )
+    return cloud
+
+
+def _options(options: Mapping[str, Any]) -> dict[str, Any]:
+    known = GraspOptions.__annotations__
+    for name in options:
+        if name not in known:
+            raise TypeError(f"unknown option {name!r}; valid: {', '.join(sorted(known))}")
+    return {name: _plain(name, value) for name, value in options.items() if value is not None}
+
+
+def _plain(name: str, value: Any) -> Any:
+    """`value` with arrays as lists and numpy scalars as numbers: what JSON can express."""
+    if isinstance(value, np.ndarray | np.generic):
+        return _plain(name, value.tolist())
+    if isinstance(value, Mapping):
+        return {str(key): _plain(name, item) for key, item in value.items()}
+    if isinstance(value, list | tuple):
+        return [_plain(name, item) for item in value]
+    if isinstance(value, float) and not np.isfinite(value):
+        raise InvalidArgument(name, f"holds {value}; give finite numbers")
+    if value is None or isinstance(value, str | int | float):
+        return value
+    raise InvalidArgument(name, f"holds a {type(value).__name__}; give numbers, strings, lists, mappings or arrays")
+
+
+def _headers(request_id: str | None) -> dict[str, str]:
+    headers = {"Accept": "application/json"}
+    if request_id is not None:
+        headers["X-Request-ID"] = header_value("request_id", request_id)
+    return headers
+
+
+def header_value(argument: str, value: str) -> str:
+    """`value`, if it can stand in an HTTP header.
+
+    Raises:
+        InvalidArgument: empty, longer than 4000 characters, holding anything but printable ASCII, or spaces at an end.
+    """
+    if not 1 <= len(value) <= 4000 or value != value.strip() or not all(" " <= character <= "~" for character in value):
+        raise InvalidArgument(argument, "cannot stand in an HTTP header; give 1 to 4000 printable ASCII characters")
+    return value

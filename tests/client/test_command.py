@@ -1,0 +1,173 @@
+from __future__ import annotations
+
+import io
+import json
+import os
+import subprocess
+import sys
+from collections.abc import Callable, Sequence
+from pathlib import Path
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import numpy as np
+import pytest
+
+from client.__main__ import main
+from service import schemas
+from tests.client.conftest import Answering, Reset, ScriptedServer, answering
+from tests.client.test_cloud_file import ply
+
+Points = np.ndarray[Any, np.dtype[np.float32]]
+ROOT = Path(__file__).resolve().parents[2]
+
+
+@pytest.fixture
+def cloud(tmp_path: Path, points: Points) -> str:
+    path = tmp_path / "cloud.ply"
+    path.write_bytes(ply(points, text=False, byte_order="<"))
+    return str(path)
+
+
+def run(
+    *arguments: str, stdin: bytes = b"", environment: dict[str, str] | None = None
+) -> subprocess.CompletedProcess[bytes]:
+    command: Sequence[str] = [sys.executable, "-m", "client", *arguments]
+    return subprocess.run(
+        command, input=stdin, capture_output=True, cwd=ROOT, env={**os.environ, **(environment or {})}, check=False
+    )
+
+
+def test_a_ply_file_becomes_an_aligned_table(
+    server: ScriptedServer, cloud: str, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    done = run(cloud, "--url", server.url, "--top-k", "3", "--up", "0", "0", "1")
+    assert done.returncode == 0, done.stderr
+    header, *rows = done.stdout.decode().splitlines()
+    assert header.split() == ["rank", "score", "x", "y", "z", "qx", "qy", "qz", "qw", "width"]
+    assert len({len(line) for line in [header, *rows]}) == 1
+    assert [row.split()[0] for row in rows] == ["1", "2", "3"]
+    values = np.array([row.split()[1:] for row in rows], dtype=float)
+    for row, wire in zip(values, found["grasps"], strict=True):
+        expected = [wire["score"], *wire["position"], *wire["quaternion_xyzw"], wire["width"]]
+        np.testing.assert_allclose(row, expected, atol=1e-3)
+    assert done.stderr.decode() == "warning: `up` is missing.\n"
+    np.testing.assert_array_equal(np.frombuffer(server.received[0].body, "<f4").reshape(-1, 3), points)
+
+
+def test_json_is_the_service_s_document_and_the_url_may_come_from_the_environment(
+    server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    buffer = io.BytesIO()
+    np.save(buffer, points)
+    done = run("-", "--json", stdin=buffer.getvalue(), environment={"GRASP_URL": server.url})
+    assert done.returncode == 0, done.stderr
+    assert json.loads(done.stdout) == found
+
+
+def test_nothing_found_prints_the_reason_and_exits_1(
+    server: ScriptedServer, cloud: str, nothing_found: dict[str, Any], capsys: pytest.CaptureFixture[str]
+) -> None:
+    server.script = [answering(nothing_found)]
+    assert main([cloud, "--url", server.url]) == 1
+    assert capsys.readouterr().out == "no grasps: all_in_collision\n"
+    assert main([cloud, "--url", server.url, "--json"]) == 1
+    assert json.loads(capsys.readouterr().out) == nothing_found
+
+
+def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict[str, Any]) -> None:
+    server.script = [answering(found)]
+    flags = (
+        "--top-k 7 --viewpoint 0.3 0 -0.6 --viewpoint 0 0 1 --up 0 0 1 --support-height -0.05 "
+        "--workspace -1 -1 -1 1 1 1 --approach 0 0 -1 30 --min-score 0.5 --min-separation 0.02 20 "
+        "--num-approach-points 16 --max-candidates 100 --unseen occupied --pregrasp-distance 0.1 "
+        "--frame-convention graspnet --seed 4 --model tesnet --request-id r-9"
+    )
+    assert main([cloud, "--url", server.url, *flags.split()]) == 0
+    query = parse_qs(urlsplit(server.received[0].target).query)
+    options = {name: json.loads(values[0]) for name, values in query.items()}
+    assert set(options) == set(schemas.GraspOptions.model_fields)
+    assert schemas.GraspOptions.model_validate_json(json.dumps(options)) == schemas.GraspOptions(
+        max_grasps=7,
+        viewpoint=[(0.3, 0, -0.6), (0, 0, 1)],
+        up=(0, 0, 1),
+        support_height=-0.05,
+        workspace=schemas.Box(min=(-1, -1, -1), max=(1, 1, 1)),
+        approach=schemas.Approach(direction=(0, 0, -1), max_angle_deg=30),
+        min_score=0.5,
+        min_separation=schemas.Separation(translation=0.02, rotation_deg=20),
+        num_approach_points=16,
+        max_candidates=100,
+        unseen="occupied",
+        pregrasp_distance=0.1,
+        frame_convention="graspnet",
+        seed=4,
+        model="tesnet",
+    )
+    assert server.received[0].headers["x-request-id"] == "r-9"
+
+
+def test_flags_left_out_stay_the_service_s_defaults(server: ScriptedServer, cloud: str, found: dict[str, Any]) -> None:
+    server.script = [answering(found)]
+    assert main([cloud, "--url", server.url, "--viewpoint", "0", "0", "1"]) == 0
+    assert server.received[0].target == "/grasps?viewpoint=%5B0.0%2C0.0%2C1.0%5D"
+
+
+@pytest.mark.parametrize(
+    "arguments",
+    [
+        ["absent.ply"],
+        ["cloud.step"],
+        [],
+        ["c.ply", "--up", "0", "0"],
+        ["c.ply", "--up", "0", "0", "nan"],
+        ["c.ply", "--support-height", "0"],
+        ["c.ply", "--unseen", "maybe"],
+    ],
+)
+def test_wrong_usage_and_unreadable_files_exit_2_with_one_reason(
+    arguments: list[str], capsys: pytest.CaptureFixture[str]
+) -> None:
+    with pytest.raises(SystemExit) as end:  # argparse ends so
+        sys.exit(main(arguments))
+    assert end.value.code == 2
+    assert "python -m client: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize(("status", "code"), [(400, 2), (413, 2), (422, 2), (429, 3), (500, 3), (503, 3), (504, 3)])
+def test_a_refusal_exits_2_for_bad_input_and_3_for_a_failing_service(
+    server: ScriptedServer,
+    cloud: str,
+    refusing: Callable[..., Answering],
+    capsys: pytest.CaptureFixture[str],
+    status: int,
+    code: int,
+) -> None:
+    server.script = [refusing(status, "100")]
+    assert main([cloud, "--url", server.url]) == code
+    captured = capsys.readouterr()
+    assert captured.out == ""
+    assert captured.err == f"python -m client: {status} A title: A detail. (request r-1)\n"
+
+
+def test_an_unreachable_or_foreign_service_exits_3(
+    server: ScriptedServer, closed_url: str, cloud: str, capsys: pytest.CaptureFixture[str]
+) -> None:
+    done = run(cloud, "--url", closed_url)
+    assert done.returncode == 3
+    assert b"cannot reach" in done.stderr
+    assert b"Traceback" not in done.stderr
+    server.script = [Answering(200, b"<html>")]
+    assert main([cloud, "--url", server.url]) == 3
+    server.script = [Reset()]
+    assert main([cloud, "--url", server.url]) == 3
+    assert capsys.readouterr().out == ""
+
+
+def test_a_cloud_with_nan_is_refused_here(tmp_path: Path, closed_url: str, capsys: pytest.CaptureFixture[str]) -> None:
+    path = tmp_path / "cloud.xyz"
+    path.write_text("0 0 nan\n1 1 1\n")
+    assert main([str(path), "--url", closed_url]) == 2
+    assert "points: 1 of 2 are NaN" in capsys.readouterr().err

@@ -1,0 +1,175 @@
+from __future__ import annotations
+
+import json
+import operator
+import pickle
+from collections.abc import Callable
+from datetime import datetime, timedelta, timezone
+from email.utils import format_datetime
+from typing import TYPE_CHECKING, Any, cast
+
+import numpy as np
+import pytest
+
+import client
+from client.reply import Answer, grasp_reply, model_reply, problem
+
+if TYPE_CHECKING:
+    from tests.client.conftest import Answering
+
+
+def _answer(document: object, status: int = 200) -> Answer:
+    return Answer(status, {"content-type": "application/json"}, json.dumps(document).encode())
+
+
+def test_every_field_of_the_document_arrives(found: dict[str, Any]) -> None:
+    reply = grasp_reply(_answer(found))
+    assert len(reply) == len(reply.grasps) == 3
+    for index, (grasp, wire) in enumerate(zip(reply.grasps, found["grasps"], strict=True)):
+        assert grasp.score == reply.scores[index] == wire["score"]
+        np.testing.assert_allclose(grasp.pose.matrix, wire["matrix"], atol=1e-12)
+        np.testing.assert_allclose(grasp.position, wire["position"])
+        np.testing.assert_allclose(abs(grasp.quaternion_xyzw @ wire["quaternion_xyzw"]), 1)
+        np.testing.assert_allclose(grasp.hand_pose.translation, wire["hand_pose"]["position"])
+        np.testing.assert_allclose(grasp.pregrasp.translation, wire["pregrasp"]["position"])
+        assert grasp.width == reply.widths[index] == wire["width"]
+        np.testing.assert_array_equal(grasp.approach_point, wire["approach_point"])
+        np.testing.assert_array_equal(grasp.contact_point, wire["contact_point"])
+        np.testing.assert_array_equal(reply.poses[index], grasp.pose.matrix)
+        np.testing.assert_array_equal(reply.hand_poses[index], grasp.hand_pose.matrix)
+        np.testing.assert_array_equal(reply.pregrasps[index], grasp.pregrasp.matrix)
+        np.testing.assert_array_equal(reply.approach_points[index], grasp.approach_point)
+        np.testing.assert_array_equal(reply.contact_points[index], grasp.contact_point)
+    assert (reply.counts.points, reply.counts.returned) == (200, 3)
+    assert dict(reply.counts.rejected) == found["counts"]["rejected"]
+    assert reply.reason is None
+    assert list(reply.warnings) == found["warnings"]
+    assert dict(reply.timings_ms) == found["timings_ms"]
+    assert (reply.model.name, reply.model.weights_sha256) == ("tesnet", "ab" * 32)
+    assert reply.request_id == "r-1"
+    assert reply.to_dict() == found
+
+
+def test_nothing_found_is_a_reply_with_a_reason_and_empty_stacks(nothing_found: dict[str, Any]) -> None:
+    reply = grasp_reply(_answer(nothing_found))
+    assert reply.grasps == ()
+    assert reply.reason == "all_in_collision"
+    assert reply.poses.shape == reply.hand_poses.shape == reply.pregrasps.shape == (0, 4, 4)
+    assert reply.approach_points.shape == reply.contact_points.shape == (0, 3)
+
+
+def test_a_reply_cannot_be_changed_not_even_after_pickling(found: dict[str, Any]) -> None:
+    reply = grasp_reply(_answer(found))
+    for same in (reply, pickle.loads(pickle.dumps(reply))):
+        for array in (same.scores, same.poses, same.widths, same.grasps[0].position, same.grasps[0].contact_point):
+            with pytest.raises(ValueError, match="read-only"):
+                array[0] = 1
+        with pytest.raises(AttributeError):
+            setattr(same, "reason", "other")  # noqa: B010 - mypy would refuse the assignment itself
+        with pytest.raises(TypeError):
+            operator.setitem(cast("dict[str, int]", same.counts.rejected), "support", 0)
+        assert same.to_dict() == found
+
+
+def test_fields_that_a_later_service_adds_are_ignored(found: dict[str, Any]) -> None:
+    found["grasps"][0]["novel"] = found["novel"] = 1
+    assert len(grasp_reply(_answer(found))) == 3
+
+
+@pytest.mark.parametrize(
+    ("change", "words"),
+    [
+        (lambda document: document.pop("counts"), "counts"),
+        (lambda document: document["grasps"][1].update(score="high"), r"grasps\.1\.score"),
+        (lambda document: document["grasps"][0]["matrix"][0].__setitem__(0, 9.0), "no rigid pose"),
+        (lambda document: document["grasps"][0]["hand_pose"].update(quaternion_xyzw=[0, 0, 0, 0]), "no rigid pose"),
+    ],
+)
+def test_another_document_is_an_unexpected_response_that_names_the_place(
+    found: dict[str, Any], change: Callable[[dict[str, Any]], None], words: str
+) -> None:
+    change(found)
+    with pytest.raises(client.UnexpectedResponse, match=words):
+        grasp_reply(_answer(found))
+
+
+@pytest.mark.parametrize("body", [b"", b"<html>hello</html>", b"[]", b"\xff\xfe"])
+def test_a_body_that_is_no_document_is_an_unexpected_response(body: bytes) -> None:
+    for parse in (grasp_reply, model_reply):
+        with pytest.raises(client.UnexpectedResponse, match=f"{len(body)} bytes"):
+            parse(Answer(200, {"content-type": "text/html"}, body))
+
+
+KINDS = {
+    400: client.BadRequest,
+    401: client.Unauthorized,
+    404: client.ProblemError,
+    413: client.PayloadTooLarge,
+    415: client.UnsupportedMediaType,
+    422: client.InvalidRequest,
+    429: client.Overloaded,
+    500: client.ServiceFault,
+    503: client.Overloaded,
+    504: client.DeadlineExceeded,
+}
+
+
+@pytest.mark.parametrize("status", KINDS)
+def test_every_status_has_its_class(status: int, refusing: Callable[..., Answering]) -> None:
+    wire = refusing(status)
+    error = problem(Answer(status, {}, wire.body))
+    assert type(error) is KINDS[status]
+    for same in (error, pickle.loads(pickle.dumps(error))):
+        assert isinstance(same, client.ProblemError)
+        assert (same.status, same.title, same.detail, same.request_id) == (status, "A title", "A detail.", "r-1")
+        assert dict(same.problem) == json.loads(wire.body)
+        assert str(same) == f"{status} A title: A detail. (request r-1)"
+
+
+@pytest.mark.parametrize("error", [client.InvalidArgument("points", "bad"), client.UnexpectedResponse("odd", 200)])
+def test_errors_survive_the_way_back_from_a_worker_process(error: Exception) -> None:
+    same = pickle.loads(pickle.dumps(error))
+    assert type(same) is type(error)
+    assert (str(same), vars(same)) == (str(error), vars(error))
+
+
+@pytest.mark.parametrize("status", [401, 413, 429, 503, 504])
+def test_a_proxy_that_refuses_in_its_own_words_is_the_same_kind_of_problem(status: int) -> None:
+    error = problem(Answer(status, {"retry-after": "3"}, b"<html>no</html>"))
+    assert type(error) is KINDS[status]
+    assert isinstance(error, client.ProblemError)
+    assert "proxy" in error.detail
+    assert error.retry_after == 3
+
+
+@pytest.mark.parametrize("status", [204, 301, 404, 418, 500, 502])
+def test_any_other_foreign_answer_is_unexpected(status: int) -> None:
+    error = problem(Answer(status, {}, b"<html>no</html>"))
+    assert type(error) is client.UnexpectedResponse
+    assert error.status == status
+
+
+def test_a_problem_document_with_another_status_than_its_answer_is_unexpected(
+    refusing: Callable[..., Answering],
+) -> None:
+    assert type(problem(Answer(500, {}, refusing(400).body))) is client.UnexpectedResponse
+
+
+@pytest.mark.parametrize(("text", "seconds"), [("0", 0.0), ("12", 12.0), ("soon", None), ("-3", None), ("", None)])
+def test_retry_after_in_seconds(text: str, seconds: float | None, refusing: Callable[..., Answering]) -> None:
+    error = problem(Answer(503, {"retry-after": text}, refusing(503).body))
+    assert isinstance(error, client.Overloaded)
+    assert error.retry_after == seconds
+
+
+def test_retry_after_as_a_date(refusing: Callable[..., Answering]) -> None:
+    def retry_after(date: datetime) -> float | None:
+        error = problem(Answer(503, {"retry-after": format_datetime(date, usegmt=True)}, refusing(503).body))
+        assert isinstance(error, client.Overloaded)
+        return error.retry_after
+
+    now = datetime.now(timezone.utc)
+    assert retry_after(now - timedelta(hours=1)) == 0
+    later = retry_after(now + timedelta(hours=1))
+    assert later is not None
+    assert 3000 < later <= 3600

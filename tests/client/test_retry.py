@@ -1,0 +1,51 @@
+from __future__ import annotations
+
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from client.errors import InvalidArgument
+from client.retry import RetryPolicy
+
+JITTER = st.floats(0, 1, exclude_max=True)
+
+
+@given(st.integers(0, 20), st.floats(0, 100), JITTER)
+def test_a_wait_is_bounded_and_never_outlasts_the_time_left(retries: int, remaining: float, jitter: float) -> None:
+    policy = RetryPolicy(max_retries=10, first_delay=0.1, max_delay=2.0)
+    wait = policy.delay(retries, remaining, jitter)
+    assert wait is None or 0.05 <= wait < min(remaining, 2.0 + 1e-9)
+
+
+@given(st.integers(0, 5), JITTER)
+def test_waits_double(retries: int, jitter: float) -> None:
+    policy = RetryPolicy(max_retries=10, first_delay=0.1, max_delay=60)
+    first, second = policy.delay(retries, 100, jitter), policy.delay(retries + 1, 100, jitter)
+    assert first is not None
+    assert second == pytest.approx(2 * first)
+
+
+@given(st.floats(0, 5), JITTER)
+def test_the_wait_that_the_service_asks_for_is_never_shortened(retry_after: float, jitter: float) -> None:
+    wait = RetryPolicy(max_delay=5).delay(0, 100, jitter, retry_after)
+    assert wait is not None
+    assert retry_after <= wait <= retry_after + 0.1
+
+
+def test_a_wait_that_is_asked_for_but_too_long_ends_the_tries() -> None:
+    assert RetryPolicy(max_delay=5).delay(0, 100, 0.0, 6.0) is None
+    assert RetryPolicy(max_delay=5).delay(0, 1.0, 0.0, 2.0) is None
+
+
+def test_tries_end_after_max_retries() -> None:
+    policy = RetryPolicy(max_retries=2)
+    assert policy.delay(1, 100, 0.5) is not None
+    assert policy.delay(2, 100, 0.5) is None
+    assert RetryPolicy(max_retries=0).delay(0, 100, 0.5) is None
+
+
+def test_an_impossible_policy_is_refused() -> None:
+    with pytest.raises(InvalidArgument, match="max_retries: is -1"):
+        RetryPolicy(max_retries=-1)
+    with pytest.raises(InvalidArgument, match="first_delay: is 10 s"):
+        RetryPolicy(first_delay=10, max_delay=1)

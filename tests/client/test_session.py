@@ -1,0 +1,260 @@
+from __future__ import annotations
+
+import asyncio
+import json
+import random
+from collections.abc import Callable
+from typing import Any
+from urllib.parse import parse_qs, urlsplit
+
+import httpx
+import numpy as np
+import pytest
+
+import client
+from client.conversation import Send, TimedOut, Wait, ask
+from client.reply import Answer, grasp_reply
+from client.request import Request
+from tests.client.conftest import Answering, Call, Reset, ScriptedServer, Stall, answering, model_document
+
+QUICK = {"retry": client.RetryPolicy(max_retries=2, first_delay=0.001)}
+Points = np.ndarray[Any, np.dtype[np.float32]]
+Refusing = Callable[..., Answering]
+
+
+def test_a_grasp_request_and_its_reply(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    reply = call(server.url, "grasps", points, up=(0, 0, 1), max_grasps=3, request_id="mine", timeout=20)
+    assert reply.to_dict() == found
+    (received,) = server.received
+    assert (received.method, urlsplit(received.target).path) == ("POST", "/grasps")
+    assert received.headers["content-type"] == "application/octet-stream"
+    assert received.headers["x-request-id"] == "mine"
+    assert 19 < float(received.headers["x-request-timeout"]) < 20
+    np.testing.assert_array_equal(np.frombuffer(received.body, "<f4").reshape(-1, 3), points)
+    query = parse_qs(urlsplit(received.target).query)
+    assert {name: json.loads(value[0]) for name, value in query.items()} == {"up": [0, 0, 1], "max_grasps": 3}
+
+
+def test_a_request_id_is_made_up_and_kept_over_retries(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [Reset(), answering(found)]
+    call(server.url, "grasps", points, client=QUICK)
+    first, second = (received.headers["x-request-id"] for received in server.received)
+    assert first == second
+    assert len(first) == 32
+
+
+def test_a_path_prefix_and_headers_are_kept(call: Call, server: ScriptedServer) -> None:
+    server.script = [answering(model_document())]
+    call(f"{server.url}/robot/7/", "model", client={"headers": {"Authorization": "Bearer key"}})
+    assert server.received[0].target == "/robot/7/model"
+    assert server.received[0].headers["authorization"] == "Bearer key"
+
+
+def test_the_model_says_what_is_loaded(call: Call, server: ScriptedServer) -> None:
+    server.script = [answering(model_document())]
+    model = call(server.url, "model")
+    assert [network.name for network in model.models] == ["tesnet"]
+    assert model.limits.max_points == 1000
+    assert model.frame_conventions == ("panda", "graspnet")
+    assert model.to_dict() == model_document()
+
+
+@pytest.mark.parametrize("lost", [1, 2])
+def test_a_lost_connection_is_tried_again(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any], lost: int
+) -> None:
+    server.script = [*(Reset() for _ in range(lost)), answering(found)]
+    assert len(call(server.url, "grasps", points, client=QUICK)) == 3
+    assert len(server.received) == lost + 1
+    assert len({received.body for received in server.received}) == 1
+
+
+def test_a_connection_lost_on_every_try_is_unreachable(call: Call, server: ScriptedServer, points: Points) -> None:
+    server.script = [Reset()]
+    with pytest.raises(client.ServiceUnreachable, match=f"cannot reach {server.url}"):
+        call(server.url, "grasps", points, client=QUICK)
+    assert len(server.received) == 3
+
+
+def test_a_refused_connection_is_unreachable(call: Call, closed_url: str, points: Points) -> None:
+    with pytest.raises(client.ServiceUnreachable, match="is the service running"):
+        call(closed_url, "grasps", points, client=QUICK)
+
+
+@pytest.mark.parametrize("status", [429, 503])
+def test_an_overloaded_service_is_asked_again(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any], refusing: Refusing, status: int
+) -> None:
+    server.script = [refusing(status, "0"), refusing(status), answering(found)]
+    assert len(call(server.url, "grasps", points, client=QUICK)) == 3
+    assert len(server.received) == 3
+
+
+def test_a_service_that_stays_overloaded_is_an_error_with_its_wait(
+    call: Call, server: ScriptedServer, points: Points, refusing: Refusing
+) -> None:
+    server.script = [refusing(503, "0")]
+    with pytest.raises(client.Overloaded) as caught:
+        call(server.url, "grasps", points, client=QUICK)
+    assert (caught.value.status, caught.value.retry_after) == (503, 0)
+    assert len(server.received) == 3
+
+
+def test_a_wait_longer_than_the_time_left_is_not_begun(
+    call: Call, server: ScriptedServer, points: Points, refusing: Refusing
+) -> None:
+    server.script = [refusing(429, "4")]
+    with pytest.raises(client.Overloaded) as caught:
+        call(server.url, "grasps", points, timeout=3)
+    assert caught.value.retry_after == 4
+    assert len(server.received) == 1
+
+
+@pytest.mark.parametrize("status", [400, 401, 404, 413, 415, 422, 500, 504])
+def test_other_refusals_are_not_tried_again(
+    call: Call, server: ScriptedServer, points: Points, refusing: Refusing, status: int
+) -> None:
+    server.script = [refusing(status)]
+    with pytest.raises(client.ProblemError, match=r"A detail\. \(request r-1\)") as caught:
+        call(server.url, "grasps", points, client=QUICK)
+    assert caught.value.status == status
+    assert len(server.received) == 1
+
+
+@pytest.mark.parametrize("first", [b"", b"{"])
+def test_a_silent_service_is_a_timeout_and_not_tried_again(
+    call: Call, server: ScriptedServer, points: Points, first: bytes
+) -> None:
+    server.script = [Stall(first)]
+    with pytest.raises(client.ServiceTimeout, match=r"within 0\.2 s; raise `timeout`"):
+        call(server.url, "grasps", points, client=QUICK, timeout=0.2)
+    assert len(server.received) == 1
+
+
+@pytest.mark.parametrize(
+    "wire", [Answering(200, b"<html>"), Answering(302, b"", {"Location": "/"}), Answering(404, b"x")]
+)
+def test_another_server_is_an_unexpected_response(
+    call: Call, server: ScriptedServer, points: Points, wire: Answering
+) -> None:
+    server.script = [wire]
+    with pytest.raises(client.UnexpectedResponse, match="check the URL") as caught:
+        call(server.url, "grasps", points)
+    assert caught.value.status == wire.status
+
+
+def test_bad_points_and_options_are_refused_before_anything_is_sent(call: Call, server: ScriptedServer) -> None:
+    with pytest.raises(client.InvalidArgument, match="points: have shape"):
+        call(server.url, "grasps", np.zeros((3, 4)))
+    with pytest.raises(TypeError, match="unknown option 'top_k'"):
+        call(server.url, "grasps", np.zeros((3, 3)), top_k=1)
+    assert server.received == []
+
+
+@pytest.mark.parametrize("url", ["127.0.0.1:8000", "ftp://host", "http://", ""])
+def test_a_url_that_is_none_is_refused(call: Call, url: str) -> None:
+    with pytest.raises(client.InvalidArgument, match=r"base_url: .*give one like http://"):
+        call(url, "live")
+
+
+@pytest.mark.parametrize("timeout", [0, -1, float("nan"), float("inf")])
+def test_a_timeout_that_is_none_is_refused(call: Call, closed_url: str, timeout: float) -> None:
+    with pytest.raises(client.InvalidArgument, match="timeout"):
+        call(closed_url, "grasps", np.zeros((1, 3)), timeout=timeout)
+    with pytest.raises(client.InvalidArgument, match="timeout"):
+        call(closed_url, "live", client={"timeout": timeout})
+
+
+@pytest.mark.parametrize("probe", ["live", "ready"])
+def test_health_is_a_yes_or_no(
+    call: Call, server: ScriptedServer, closed_url: str, refusing: Refusing, probe: str
+) -> None:
+    server.script = [answering({"status": probe}), refusing(503), Reset()]
+    assert call(server.url, probe) is True
+    assert call(server.url, probe) is False
+    assert call(server.url, probe) is False
+    assert call(closed_url, probe) is False
+    assert {received.target for received in server.received} == {f"/health/{probe}"}
+
+
+def test_waiting_ends_when_the_service_is_ready(call: Call, server: ScriptedServer, refusing: Refusing) -> None:
+    server.script = [Reset(), refusing(503), answering({"status": "ready"})]
+    assert call(server.url, "wait_until_ready", 30) is None
+    assert len(server.received) == 3
+
+
+def test_waiting_in_vain_says_what_was_seen_last(
+    call: Call, server: ScriptedServer, closed_url: str, refusing: Refusing
+) -> None:
+    server.script = [refusing(503)]
+    with pytest.raises(client.ServiceTimeout, match=r"not ready after 0\.3 s: 503 A title: A detail"):
+        call(server.url, "wait_until_ready", 0.3)
+    with pytest.raises(client.ServiceTimeout, match="cannot reach"):
+        call(closed_url, "wait_until_ready", 0.1)
+
+
+def test_one_async_client_serves_many_requests_at_once(
+    server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+
+    async def go() -> list[client.GraspReply]:
+        async with client.AsyncGraspClient(server.url) as opened:
+            return await asyncio.gather(*(opened.grasps(points, seed=seed) for seed in range(8)))
+
+    assert [len(reply) for reply in asyncio.run(go())] == [3] * 8
+    assert len({received.target for received in server.received}) == 8
+
+
+def test_the_transport_can_be_replaced(points: Points, found: dict[str, Any]) -> None:
+    transport = httpx.MockTransport(lambda _: httpx.Response(200, json=found))
+    with client.GraspClient("http://robot.invalid", transport=transport) as opened:
+        assert len(opened.grasps(points)) == 3
+
+
+def test_the_deadline_shrinks_with_every_try(refusing: Refusing) -> None:
+    """The conversation itself, with a clock in the test's hand: no network and no waiting."""
+    now = 0.0
+    refused = Answer(503, {"retry-after": "1"}, refusing(503).body)
+    policy = client.RetryPolicy(max_retries=5, first_delay=0.1)
+    steps = ask(
+        Request("POST", "/grasps"), grasp_reply, timeout=5, policy=policy, clock=lambda: now, rng=random.Random(0)
+    )
+    step = next(steps)
+    budgets = []
+    for _ in range(2):
+        assert isinstance(step, Send)
+        budgets.append((step.timeout, float(step.request.headers["X-Request-Timeout"])))
+        now += 0.5
+        wait = steps.send(refused)
+        assert isinstance(wait, Wait)
+        assert 1 <= wait.seconds <= 1.2
+        now += wait.seconds
+        step = steps.send(None)
+    assert isinstance(step, Send)
+    now += 1.5
+    with pytest.raises(client.Overloaded):  # half a second is left, and the service asks for one
+        steps.send(refused)
+    budgets.append((step.timeout, float(step.request.headers["X-Request-Timeout"])))
+    assert budgets[0][0] == 5
+    assert budgets == sorted(budgets, reverse=True)
+    assert all(0 < theirs < ours for ours, theirs in budgets)
+
+
+def test_a_timeout_ends_the_conversation() -> None:
+    steps = ask(
+        Request("GET", "/model"),
+        grasp_reply,
+        timeout=5,
+        policy=client.RetryPolicy(),
+        clock=lambda: 0.0,
+        rng=random.Random(0),
+    )
+    assert not isinstance(next(steps), Wait)
+    with pytest.raises(client.ServiceTimeout):
+        steps.send(TimedOut())
