@@ -1,0 +1,310 @@
+"""`python -m simharness`: clear tables through the service and count; `replay` shows one attempt again.
+
+Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker failed in mid-run,
+what was done is kept; 130 and 143 stopped by Ctrl-C and by SIGTERM.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import signal
+import sys
+from collections.abc import Sequence
+from contextlib import ExitStack
+from datetime import datetime, timezone
+from pathlib import Path
+from types import FrameType
+from typing import TYPE_CHECKING, Any, get_args
+
+from tqdm import tqdm
+
+from simharness.camera import PRESETS
+from simharness.errors import RunBroken, SimError, UsageError
+from simharness.execute import Executor
+from simharness.folder import PAGE_FILE, REPORT_FILE, RunFolder
+from simharness.metrics import summarise
+from simharness.objects import SceneKind, load_object_set
+from simharness.page import page
+from simharness.photographer import Photographer, attempts_to_show
+from simharness.records import RoundRecord, RunSettings
+from simharness.replay import find_attempt, replay
+from simharness.report import package_versions, percent, report, table
+from simharness.run import Hooks, Run, run
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+EXIT_USAGE = 2
+EXIT_BROKEN = 3
+
+DEFAULT_OBJECTS: dict[SceneKind, str] = {"packed": "procedural", "pile": "pybullet-random"}
+DEFAULT_WORKERS = min(2, os.cpu_count() or 1)
+MAX_GRASPS_WATCHED = 10
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Carry out a command line; the exit code."""
+    given = list(sys.argv[1:] if arguments is None else arguments)
+    try:
+        if given[:1] == ["replay"]:
+            return _replay(_replay_parser().parse_args(given[1:]))
+        return _run(_run_parser().parse_args(given))
+    except RunBroken as error:
+        return _fail(error, EXIT_BROKEN)
+    except SimError as error:
+        return _fail(error, EXIT_USAGE)
+    except KeyboardInterrupt:
+        return 128 + signal.SIGINT
+
+
+def _fail(error: SimError, code: int) -> int:
+    print(f"simharness: {error}", file=sys.stderr)
+    return code
+
+
+def _run(options: argparse.Namespace) -> int:
+    settings = _settings(options)
+    objects = load_object_set(settings.objects, settings.scene, _path(settings.exclude), _path(settings.only))
+    folder = RunFolder(options.out or _default_out(settings))
+    signals = _Signals()
+    with ExitStack() as stack:
+        progress = _Progress(settings)
+        stack.callback(progress.close)
+        stack.enter_context(signals)
+        event = None
+        if options.watch:
+            # viser is needed for --watch alone.
+            from simharness.watch import Watcher  # noqa: PLC0415
+
+            watcher = stack.enter_context(Watcher(options.watch_port))
+            print(f"watch: {watcher.url}", file=sys.stderr, flush=True)
+            event = watcher
+            progress.also(watcher.show_summary)
+        result = run(
+            settings,
+            objects,
+            folder,
+            workers=1 if options.watch else options.workers,
+            url=options.url,
+            resume=options.resume,
+            hooks=Hooks(progress.start, progress.add, event),
+        )
+    _leave(result, folder)
+    print(table(result))
+    print(f"report    {folder.path / PAGE_FILE}")
+    if signals.caught is not None:
+        return 128 + signals.caught
+    if result.stopped_by is not None:
+        print(f"simharness: {result.stopped_by}", file=sys.stderr)
+        return EXIT_BROKEN
+    return 0
+
+
+def _leave(result: Run, folder: RunFolder) -> None:
+    """Write the reports."""
+    shown = attempts_to_show(result.rounds, result.settings.seeds[0])
+    if result.complete:
+        Photographer(result.settings, folder.pictures).keep_only(shown)
+    content = report(result, package_versions())
+    folder.write_json(REPORT_FILE, content)
+    folder.write_text(PAGE_FILE, page(result, content, shown, folder.pictures))
+
+
+def _replay(options: argparse.Namespace) -> int:
+    folder = RunFolder(options.folder)
+    settings, _, _ = folder.read_run()
+    rounds = folder.read_rounds()
+    recorded = find_attempt(rounds, options.attempt)
+    objects = load_object_set(settings.objects, settings.scene, _path(settings.exclude), _path(settings.only))
+    played = next(record for record in rounds if (record.seed, record.round) == (recorded.seed, recorded.round))
+    event = replay(settings, objects, played, recorded.attempt)
+    target = folder.path / f"replay-{options.attempt}"
+    target.mkdir(exist_ok=True)
+    pictures = Photographer(settings, target).take(event)
+    print(f"attempt {options.attempt}: seed {recorded.seed}, round {recorded.round}, its attempt {recorded.attempt}")
+    lifted = f" ({', '.join(event.record.grasped)})" if event.record.grasped else ""
+    print(f"outcome {event.record.outcome}{lifted}, score {recorded.score:.3f}; recorded {recorded.outcome}")
+    for path in pictures:
+        print(path)
+    return 0
+
+
+def _run_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m simharness",
+        description="Clear simulated tables through the grasp service and report success rates. "
+        "`python -m simharness replay DIR --attempt K` shows one attempt again.",
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add("--rounds", type=_at_least(1), default=100, help="rounds for each seed (default %(default)s)")
+    add("--scene", choices=get_args(SceneKind), default="packed", help="default %(default)s")
+    add(
+        "--objects",
+        metavar="NAME_OR_PATH",
+        help="procedural, pybullet-random, a folder of URDF/OBJ files or a .txt list of them "
+        "(default: procedural for packed, pybullet-random for pile scenes)",
+    )
+    add("--exclude", metavar="LIST", help="file with names of objects to leave out")
+    add("--only", metavar="LIST", help="file with names of objects to use alone")
+    add("--camera", choices=PRESETS, default="random", help="default %(default)s")
+    add(
+        "--noise-std",
+        type=_not_negative,
+        metavar="M",
+        help="noise on each coordinate of each point, metres (default: the camera's)",
+    )
+    add("--depth-noise-std", type=_not_negative, metavar="M", help="noise on depth, metres (default: the camera's)")
+    add("--executor", choices=get_args(Executor), default="edge", help="how grasps are judged (default %(default)s)")
+    seeds = parser.add_mutually_exclusive_group()
+    seeds.add_argument("--seed", type=_at_least(0), help="run seed (default 0)")
+    seeds.add_argument("--seeds", type=_at_least(0), nargs="+", metavar="SEED", help="several run seeds, pooled")
+    add(
+        "--workers", type=_at_least(1), default=DEFAULT_WORKERS, help="processes that play rounds (default %(default)s)"
+    )
+    add("--model", default="tesnet", help="network to ask for (default %(default)s)")
+    add("--url", help="a running service (default: one is started for the run)")
+    add("--out", type=Path, metavar="DIR", help="where the reports go (default: a new folder in runs/)")
+    add("--resume", action="store_true", help="continue the run in --out")
+    add("--watch", action="store_true", help="show the run live in a browser page; plays with one worker")
+    add(
+        "--watch-port",
+        type=_at_least(0),
+        default=8080,
+        help="port of that page; the next free one is taken (default %(default)s)",
+    )
+    return parser
+
+
+def _replay_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m simharness replay", description="Render one attempt of a run again."
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="the --out of a run")
+    parser.add_argument(
+        "--attempt",
+        type=_at_least(0),
+        required=True,
+        metavar="K",
+        help="which attempt: line of attempts.jsonl, the first is 0",
+    )
+    return parser
+
+
+def _settings(options: argparse.Namespace) -> RunSettings:
+    seeds = tuple(options.seeds or [options.seed or 0])
+    if len(set(seeds)) < len(seeds):
+        raise UsageError(f"--seeds {' '.join(map(str, seeds))}: a seed is named twice; name each once")
+    if options.resume and options.out is None:
+        raise UsageError("--resume needs --out: the folder of the run to continue")
+    return RunSettings(
+        rounds=options.rounds,
+        seeds=seeds,
+        scene=options.scene,
+        objects=_absolute(options.objects or DEFAULT_OBJECTS[options.scene]),
+        exclude=_absolute(options.exclude),
+        only=_absolute(options.only),
+        camera=options.camera,
+        noise_std=options.noise_std,
+        depth_noise_std=options.depth_noise_std,
+        executor=options.executor,
+        model=options.model,
+        max_grasps=MAX_GRASPS_WATCHED if options.watch else 1,
+    )
+
+
+def _absolute(name: str | None) -> Any:
+    """A path that exists as an absolute one, so that a run is found again from anywhere; other names as they are."""
+    return str(Path(name).resolve()) if name is not None and Path(name).exists() else name
+
+
+def _path(name: str | None) -> Path | None:
+    return None if name is None else Path(name)
+
+
+def _default_out(settings: RunSettings) -> Path:
+    now = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
+    return Path("runs") / f"{settings.scene}-{settings.executor}-{now}"
+
+
+def _at_least(minimum: int) -> Any:
+    def parse(text: str) -> int:
+        try:
+            value = int(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
+        if value < minimum:
+            raise argparse.ArgumentTypeError(f"{value} is too small; give {minimum} or more")
+        return value
+
+    return parse
+
+
+def _not_negative(text: str) -> float:
+    try:
+        value = float(text)
+    except ValueError:
+        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+    if not 0 <= value < 1:
+        raise argparse.ArgumentTypeError(f"{text} is out of range; give metres, 0 or more and less than 1")
+    return value
+
+
+class _Progress:
+    """A bar on stderr with the rates so far."""
+
+    def __init__(self, settings: RunSettings) -> None:
+        self._total = settings.rounds * len(settings.seeds)
+        self._rounds: list[RoundRecord] = []
+        self._bar: Any = None
+        self._others: list[Any] = []
+
+    def also(self, show: Any) -> None:
+        self._others.append(show)
+
+    def start(self, done: Sequence[RoundRecord]) -> None:
+        self._rounds = list(done)
+        self._bar = tqdm(total=self._total, initial=len(done), unit="round", file=sys.stderr, dynamic_ncols=True)
+        self._show()
+
+    def add(self, record: RoundRecord) -> None:
+        self._rounds.append(record)
+        self._bar.update()
+        self._show()
+
+    def close(self) -> None:
+        if self._bar is not None:
+            self._bar.close()
+
+    def _show(self) -> None:
+        summary = summarise(self._rounds)
+        self._bar.set_postfix_str(f"GSR {percent(summary.gsr)}, DR {percent(summary.dr)}")
+        for show in self._others:
+            show(summary)
+
+
+class _Signals:
+    """SIGTERM ends a run as Ctrl-C does; `caught` says which of the two came."""
+
+    def __init__(self) -> None:
+        self.caught: int | None = None
+        self._before: dict[int, Any] = {}
+
+    def __enter__(self) -> Self:
+        for number in (signal.SIGINT, signal.SIGTERM):
+            self._before[number] = signal.signal(number, self._catch)
+        return self
+
+    def __exit__(self, *_: object) -> None:
+        for number, handler in self._before.items():
+            signal.signal(number, handler)
+
+    def _catch(self, number: int, _frame: FrameType | None) -> None:
+        if self.caught is None:  # a second one must not break off the tidying up
+            self.caught = number
+            raise KeyboardInterrupt
+
+
+if __name__ == "__main__":
+    sys.exit(main())

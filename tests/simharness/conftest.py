@@ -1,0 +1,109 @@
+"""What the harness's tests share: a stand-in for the service, and runs to report about."""
+
+from __future__ import annotations
+
+import subprocess
+import sys
+from collections.abc import Callable, Iterator
+from contextlib import ExitStack, contextmanager
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simharness.records import AttemptRecord, Latency, NoGraspRecord, RoundEnd, RoundRecord, RunSettings
+
+STUB = Path(__file__).with_name("stub_service.py")
+
+MakeSettings = Callable[..., RunSettings]
+MakeRound = Callable[..., RoundRecord]
+StartStub = Callable[..., str]
+
+
+@pytest.fixture(scope="session")
+def stub_command() -> tuple[str, ...]:
+    """What starts the stand-in in place of `python -m service`."""
+    return (sys.executable, str(STUB))
+
+
+@pytest.fixture
+def start_stub() -> Iterator[StartStub]:
+    """Start a stand-in service; its URL. It ends with the test."""
+    with ExitStack() as stack:
+        yield lambda *options: stack.enter_context(_stub(options))
+
+
+@contextmanager
+def _stub(options: tuple[str, ...]) -> Iterator[str]:
+    process = subprocess.Popen([sys.executable, str(STUB), *options], stdout=subprocess.PIPE, text=True)
+    assert process.stdout is not None
+    try:
+        yield process.stdout.readline().strip()
+    finally:
+        process.terminate()
+        process.wait(10)
+        process.stdout.close()
+
+
+@pytest.fixture(scope="session")
+def make_settings() -> MakeSettings:
+    """Settings of a small run, with changes."""
+
+    def make(**changes: Any) -> RunSettings:
+        values: dict[str, Any] = {
+            "rounds": 2,
+            "seeds": (0,),
+            "scene": "packed",
+            "objects": "procedural",
+            "exclude": None,
+            "only": None,
+            "camera": "random",
+            "noise_std": None,
+            "depth_noise_std": None,
+            "executor": "edge",
+            "model": "tesnet",
+            "max_grasps": 1,
+        }
+        return RunSettings(**{**values, **changes})
+
+    return make
+
+
+@pytest.fixture(scope="session")
+def make_round() -> MakeRound:
+    """A round with attempts of given outcomes: `make_round(0, 3, ["success", "slip"])`."""
+
+    def make(
+        seed: int, number: int, outcomes: list[Any], no_grasps: tuple[str, ...] = (), ended: RoundEnd = "empty"
+    ) -> RoundRecord:
+        objects = tuple(f"set/thing_{index}" for index in range(5))
+        attempts = tuple(
+            AttemptRecord(
+                seed=seed,
+                round=number,
+                attempt=index,
+                observation=index,
+                request_seed=7,
+                viewpoints=((0.1, 0.2, 0.7),),
+                T_world_grasp=np.eye(4),
+                width=0.08,
+                score=0.9,
+                outcome=outcome,
+                grasped=(objects[index],) if outcome == "success" else (),
+                objects=objects,
+                contact_at_start=False,
+                contact_on_way=False,
+                counts={"points": 100},
+                latency=Latency(service=10.0 + index, round_trip=12.0 + index),
+            )
+            for index, outcome in enumerate(outcomes)
+        )
+        observations = range(len(outcomes), len(outcomes) + len(no_grasps))
+        empty = tuple(
+            NoGraspRecord(observation, reason, {}, None)
+            for observation, reason in zip(observations, no_grasps, strict=True)
+        )
+        return RoundRecord(seed, number, objects, ended, attempts, empty)
+
+    return make
