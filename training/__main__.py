@@ -1,0 +1,121 @@
+"""`python -m training generate|fit|evaluate`: labels, weights and their measures."""
+
+from __future__ import annotations
+
+import argparse
+import json
+import sys
+from collections.abc import Sequence
+from pathlib import Path
+from typing import get_args
+
+from simharness.camera import Preset
+from simharness.errors import SimError
+from tesnet.errors import TesnetError
+from training.evaluate import evaluate
+from training.fit import PRESETS, fit
+from training.generate import GenerateConfig, generate
+from training.labels import LabelsError
+
+
+def main(arguments: Sequence[str] | None = None) -> int:
+    """Runs a command; returns 0, or 2 after printing why its input cannot be used."""
+    options = _parser().parse_args(arguments)
+    try:
+        result = options.run(options)
+    except (LabelsError, SimError, TesnetError) as error:
+        print(f"error: {error}", file=sys.stderr)
+        return 2
+    print(json.dumps(result, indent=2))
+    return 0
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(prog="python -m training", description=__doc__)
+    commands = parser.add_subparsers(required=True)
+    _add_generate(commands.add_parser("generate", help="simulate grasps and store their outcomes"))
+    _add_fit(commands.add_parser("fit", help="train a network on stored labels"))
+    _add_evaluate(commands.add_parser("evaluate", help="measure a network on stored labels"))
+    return parser
+
+
+def _positive(text: str) -> int:
+    value = int(text)
+    if value < 1:
+        raise argparse.ArgumentTypeError(f"{value} is not positive")
+    return value
+
+
+def _add_generate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--scene", choices=("packed", "pile"), required=True)
+    parser.add_argument("--objects", required=True, help="object sets, joined with commas: names, folders or lists")
+    parser.add_argument("--exclude", type=Path, help="list of objects that no scene may hold")
+    parser.add_argument("--labels", type=_positive, required=True, help="how many, all runs on --out together")
+    parser.add_argument("--views", type=_positive, default=2, help="camera views of each scene")
+    parser.add_argument("--labels-per-view", type=_positive, default=320)
+    parser.add_argument("--colliding-share", type=float, default=0.7, help="part of the labels from blocked candidates")
+    parser.add_argument("--camera", choices=get_args(Preset), default="random")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--workers", type=_positive, default=1)
+    parser.add_argument("--out", type=Path, required=True)
+    parser.add_argument("--resume", action="store_true", help="go on where an earlier run stopped")
+    parser.set_defaults(run=_generate)
+
+
+def _generate(options: argparse.Namespace) -> dict[str, object]:
+    config = GenerateConfig(
+        scene=options.scene,
+        objects=options.objects,
+        exclude=options.exclude,
+        seed=options.seed,
+        views=options.views,
+        labels_per_view=options.labels_per_view,
+        colliding_share=options.colliding_share,
+        camera=options.camera,
+    )
+    return generate(config, options.labels, options.workers, options.out, options.resume)
+
+
+def _add_fit(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--model", default="tesnet")
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="folders of labelled training scenes")
+    parser.add_argument(
+        "--validation", type=Path, nargs="+", required=True, help="folders of labelled validation scenes"
+    )
+    parser.add_argument("--preset", default="default", choices=sorted(PRESETS))
+    parser.add_argument("--epochs", type=_positive, help="stop after so many, whatever the schedule")
+    parser.add_argument("--threads", type=_positive, default=2)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--version", default="0", help="version that the weights' header carries")
+    parser.add_argument("--out", type=Path, required=True, help="weights file; its checkpoint lies beside it")
+    parser.set_defaults(run=_fit)
+
+
+def _fit(options: argparse.Namespace) -> dict[str, object]:
+    return fit(
+        options.model,
+        options.data,
+        options.validation,
+        PRESETS[options.preset],
+        options.out,
+        epochs=options.epochs,
+        threads=options.threads,
+        seed=options.seed,
+        version=options.version,
+    )
+
+
+def _add_evaluate(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--model", default="tesnet")
+    parser.add_argument("--weights", type=Path, help="default: the weights shipped for the model")
+    parser.add_argument("--data", type=Path, nargs="+", required=True)
+    parser.add_argument("--seed", type=int, default=0)
+    parser.set_defaults(run=_evaluate)
+
+
+def _evaluate(options: argparse.Namespace) -> dict[str, object]:
+    return evaluate(options.model, options.weights, options.data, options.seed)
+
+
+if __name__ == "__main__":
+    sys.exit(main())

@@ -1,0 +1,48 @@
+"""What a training view is varied by: centred, turned at random, its options withheld now and then."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from tesnet.geometry import Pose
+from training.labels import LabelledView
+
+WITHHOLD_UP = 0.1
+WITHHOLD_SUPPORT = 0.1
+"""Chances that a view is shown without `up` (and so without a support plane), or without the plane alone."""
+
+
+def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
+    """The view with its cloud centred (the paper's eq. 9) and turned at random (eqs. 10 to 12).
+
+    TES-Net's inputs do not change under this, other networks' do. `up` and the support plane are withheld in some
+    views, since a caller may not know them.
+    """
+    cloud = view.cloud
+    rotation = random_rotation(rng)
+    turn = torch.tensor(rotation, dtype=torch.float32)
+    centre = cloud.points.mean(dim=0)
+    height = cloud.support_height
+    if height is not None and cloud.up is not None:
+        height -= float(centre @ cloud.up)
+    chance = rng.random()
+    keep_up = chance >= WITHHOLD_UP
+    turned = replace(
+        cloud,
+        points=(cloud.points - centre) @ turn.T,
+        normals=cloud.normals @ turn.T,
+        view_directions=cloud.view_directions @ turn.T,
+        viewpoints=(cloud.viewpoints - centre) @ turn.T,
+        up=turn @ cloud.up if cloud.up is not None and keep_up else None,
+        support_height=height if keep_up and chance >= WITHHOLD_UP + WITHHOLD_SUPPORT else None,
+        T_cloud_canonical=cloud.T_cloud_canonical @ Pose(rotation, rotation @ -centre.double().numpy()).inverse(),
+    )
+    return replace(view, cloud=turned)
+
+
+def random_rotation(rng: np.random.Generator) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
+    """A rotation matrix drawn uniformly: the unit quaternion of four normal variates."""
+    return np.array(Pose.from_quaternion(rng.normal(size=4), np.zeros(3)).rotation)

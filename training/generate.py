@@ -1,0 +1,215 @@
+"""Simulated labels: scenes are made, observed and prepared as the service does it, and candidates are really tried.
+
+Each scene is one job and one file, so a run that is stopped goes on where it was (`--resume`).
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+import time
+from collections.abc import Sequence
+from dataclasses import asdict, dataclass
+from pathlib import Path
+from typing import Any, Literal
+
+import numpy as np
+import torch
+from tqdm import tqdm
+
+from simharness.camera import Preset, observe
+from simharness.execute import label_strict, snapshot_of
+from simharness.hand import Hand
+from simharness.objects import ObjectModel, load_object_set
+from simharness.scene import PERCEPTION_BOX, TABLE_HEIGHT, describe, make_scene
+from simharness.world import World
+from tesnet import candidates, cloud
+from tesnet.collision import in_collision
+from tesnet.geometry import PANDA
+from tesnet.query import GraspQuery
+from training.labels import OUTCOMES, LabelledView, LabelsError, save_scene, scene_files
+
+APPROACH_DISTANCE = 0.05
+
+
+@dataclass(frozen=True, slots=True)
+class GenerateConfig:
+    """What is generated.
+
+    Args:
+        scene: `packed` or `pile`.
+        objects: names of object sets, joined with commas; each scene takes one of them.
+        exclude: a list of objects that no scene may hold.
+        seed: scene i of a seed is the same whatever else is asked for.
+        views: camera views of each scene.
+        labels_per_view: at most this many candidates of a view are tried.
+        colliding_share: the part of them drawn from candidates that collide with the observed cloud.
+        camera: preset.
+    """
+
+    scene: Literal["packed", "pile"]
+    objects: str
+    exclude: Path | None = None
+    seed: int = 0
+    views: int = 2
+    labels_per_view: int = 320
+    colliding_share: float = 0.7
+    camera: Preset = "random"
+
+
+def generate(config: GenerateConfig, labels: int, workers: int, out: Path, resume: bool = False) -> dict[str, Any]:
+    """Writes scenes to `out` until they hold `labels` labels; returns and stores the account of what is there.
+
+    Raises:
+        LabelsError: `out` holds scenes and `resume` is not set, or scenes of another configuration.
+    """
+    out.mkdir(parents=True, exist_ok=True)
+    settings = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(config).items()}
+    _claim(out, settings, resume)
+    object_sets(config)  # fail here, not in a worker
+    done = {int(path.stem.split("_")[1]) for path in out.glob("scene_*.npz")}
+    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+    for path in scene_files([out]) if done else []:
+        counts += np.load(path)["counts"]
+    started, fresh, busy_s = time.monotonic(), 0, 0.0
+    pending = (number for number in range(10**9) if number not in done)
+    context = multiprocessing.get_context("spawn")
+    with context.Pool(workers, _start_worker, (config, out)) as pool, tqdm(total=labels, unit="label") as progress:
+        progress.update(int(counts.sum()))
+        jobs: list[Any] = []
+        while counts.sum() < labels:
+            while len(jobs) < 2 * workers:
+                jobs.append(pool.apply_async(_make_scene_file, (next(pending),)))
+            scene_counts, seconds = jobs.pop(0).get()
+            counts += scene_counts
+            fresh += int(scene_counts.sum())
+            busy_s += seconds
+            progress.update(int(scene_counts.sum()))
+            progress.set_postfix(success=f"{counts[0] / max(1, counts.sum()):.3f}")
+        for job in jobs:
+            counts += job.get()[0]
+    account = {
+        "settings": settings,
+        "labels": int(counts.sum()),
+        "scenes": len(list(out.glob("scene_*.npz"))),
+        "outcomes": dict(zip(OUTCOMES, counts.tolist(), strict=True)),
+        "this_run": {
+            "labels": fresh,
+            "seconds": round(time.monotonic() - started, 1),
+            "labels_per_worker_second": round(fresh / max(busy_s, 1e-9), 1),
+        },
+    }
+    (out / "account.json").write_text(json.dumps(account, indent=2) + "\n")
+    return account
+
+
+def _claim(out: Path, settings: dict[str, Any], resume: bool) -> None:
+    """Binds the folder to one configuration."""
+    path = out / "settings.json"
+    if not path.exists():
+        path.write_text(json.dumps(settings, indent=2) + "\n")
+        return
+    if not resume:
+        raise LabelsError(f"{out} already holds scenes; add --resume to go on, or choose another folder")
+    stored = json.loads(path.read_text())
+    different = sorted(key for key in settings if stored.get(key) != settings[key])
+    if different:
+        raise LabelsError(
+            f"{out} was made with other settings ({', '.join(f'{key}: {stored.get(key)!r}' for key in different)}); "
+            "use the same ones, or another folder"
+        )
+
+
+def object_sets(config: GenerateConfig) -> list[tuple[ObjectModel, ...]]:
+    """The object sets that scenes are made of, one per name in `config.objects`."""
+    return [load_object_set(name, config.scene, exclude=config.exclude) for name in config.objects.split(",")]
+
+
+_worker: tuple[GenerateConfig, Path, list[tuple[ObjectModel, ...]]]
+
+
+def _start_worker(config: GenerateConfig, out: Path) -> None:
+    global _worker  # noqa: PLW0603  a pool's initializer has no other way to hand state to its jobs
+    os.nice(10)
+    torch.set_num_threads(1)
+    _worker = (config, out, object_sets(config))
+
+
+def _make_scene_file(number: int) -> tuple[np.ndarray[Any, np.dtype[np.int64]], float]:
+    """Labels scene `number` and writes it; counts of the outcomes, and the seconds it took."""
+    config, out, sets = _worker
+    started = time.monotonic()
+    description, views = label_scene(config, sets, number)
+    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+    for view in views:
+        counts += np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES))
+    save_scene(out / f"scene_{number:07d}.npz", description, views, counts)
+    return counts, time.monotonic() - started
+
+
+def label_scene(
+    config: GenerateConfig, sets: Sequence[tuple[ObjectModel, ...]], number: int
+) -> tuple[dict[str, Any], list[LabelledView]]:
+    """Makes scene `number`, observes it from `config.views` cameras and tries candidates of each view."""
+    rng = np.random.default_rng([config.seed, number, 0 if config.scene == "packed" else 1])
+    models = sets[int(rng.integers(len(sets)))]
+    with World() as world:
+        hand = Hand(world)
+        # Fewer objects, too: a table that is being cleared holds fewer and fewer.
+        scene = make_scene(world, config.scene, models, rng, num_objects=int(rng.choice([1, 2, 3, 4, 5, 5])))
+        description = describe(scene) | {"seed": config.seed, "number": number, "cameras": []}
+        views: list[LabelledView] = []
+        if not scene.placed:
+            return description, views
+        for _ in range(config.views):
+            observation = observe(world, config.camera, rng)
+            description["cameras"].append(observation.Ts_world_camera.tolist())
+            view = _label_view(world, hand, observation.points_world, observation.viewpoints, config, rng)
+            if view is not None:
+                views.append(view)
+        return description, views
+
+
+def _label_view(
+    world: World, hand: Hand, points_world: Any, viewpoints: Any, config: GenerateConfig, rng: np.random.Generator
+) -> LabelledView | None:
+    query = GraspQuery(
+        points_world,
+        viewpoints=viewpoints,
+        up=np.array([0.0, 0.0, 1.0]),
+        workspace=PERCEPTION_BOX,
+        support_height=TABLE_HEIGHT,
+        seed=int(rng.integers(2**31)),
+    )
+    prepared = cloud.prepare(query, cloud.PreparationConfig(), torch.device("cpu"))
+    if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
+        return None
+    found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
+    free = ~in_collision(prepared, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
+    chosen = _choose(free.numpy(), config, rng)
+    if len(chosen) == 0:
+        return None
+    which = torch.from_numpy(chosen)
+    picked = found.select(which)
+    Ts_world_grasp = prepared.T_cloud_canonical.matrix @ picked.Ts_canonical_grasp.double().numpy()
+    with snapshot_of(world) as snapshot:
+        kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), PANDA.max_width), snapshot)
+    return LabelledView(
+        cloud=prepared,
+        approach=picked.approach,
+        contact=picked.contact,
+        outcomes=torch.tensor([OUTCOMES.index(kind) for kind in kinds], dtype=torch.uint8),
+        collision_free=free[which],
+        scene=config.scene,
+    )
+
+
+def _choose(free: Any, config: GenerateConfig, rng: np.random.Generator) -> Any:
+    """Indices of the candidates to try: free ones, drawn at random, and some that collide with the observed cloud."""
+    clear, blocked = np.flatnonzero(free), np.flatnonzero(~free)
+    num_blocked = min(len(blocked), round(config.labels_per_view * config.colliding_share))
+    num_clear = min(len(clear), config.labels_per_view - num_blocked)
+    return np.sort(
+        np.concatenate([rng.choice(clear, num_clear, replace=False), rng.choice(blocked, num_blocked, replace=False)])
+    ).astype(np.int64)
