@@ -23,7 +23,7 @@ OTHER_COLOUR = (148, 163, 184)
 """Of the hand: an attempt that succeeded, one that failed, a grasp that was not carried out."""
 
 _BACKGROUND = (246, 247, 249)
-_CLOUD_CAMERA = CameraIntrinsics(640, 480, 1080, 1080, 320, 260)
+_CLOUD_CAMERA = CameraIntrinsics(640, 480, 980, 980, 320, 250)
 _CLOUD_DISTANCE = 0.5
 _POINT_RADIUS_PX = 3
 _LINE_PX = 4
@@ -31,7 +31,7 @@ _LINE_PX = 4
 _TABLE_MIDDLE = np.array([0.15, 0.15, 0.10])
 """Metres in the world: where pictures look."""
 
-_CLOSE_UP_PX = (400, 300)
+_CLOSE_UP_PX = (320, 240)
 """Width and height of the part of a camera image that shows the workspace."""
 
 _PALETTE = np.array(

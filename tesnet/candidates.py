@@ -66,30 +66,45 @@ class Candidates:
 def generate(
     cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, gripper: Gripper = PANDA
 ) -> tuple[Candidates, dict[str, int]]:
-    """At most `max_candidates` candidates, and how many pairs each mask dropped (support, from_below, approach)."""
+    """At most `max_candidates` candidates, and how many pairs each mask dropped (support, from_below, approach).
+
+    While the approach points yield fewer than half of that, as beside flat objects, four times as many are tried.
+    """
     generator = torch.Generator().manual_seed(query.seed)
     start = int(torch.randint(len(cloud), (1,), generator=generator))
-    approach_points = farthest_points(cloud.points, query.num_approach_points, start)
-    approach, contact = pairs_in_reach(cloud, approach_points, config)
-    poses = grasp_poses(cloud.points[approach], cloud.points[contact], cloud.normals[contact])
-    candidates = Candidates(approach, contact, poses)
-
-    rejected = {}
-    z = candidates.Ts_canonical_grasp[:, :3, 2]
-    masks = {
-        "from_below": _comes_from_behind(cloud, candidates, config),
-        "approach": _outside_cone(cloud, z, query),
-        "support": hand_clearance(cloud, candidates.Ts_canonical_grasp, gripper) < config.support_clearance,
-    }
-    alive = torch.ones(len(candidates), dtype=torch.bool, device=z.device)
-    for name, bad in masks.items():
-        rejected[name] = int((bad & alive).sum())
-        alive &= ~bad
+    count = query.num_approach_points
+    while True:
+        candidates, alive, rejected = _search(
+            cloud, query, config, gripper, farthest_points(cloud.points, count, start)
+        )
+        if 2 * int(alive.sum()) >= query.max_candidates or count >= len(cloud):
+            break
+        count *= 4
     survivors = alive.nonzero()[:, 0]
     if len(survivors) > query.max_candidates:
         chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values
         survivors = survivors[chosen.to(survivors.device)]
     return candidates.select(survivors), rejected
+
+
+def _search(
+    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, gripper: Gripper, approach_points: Tensor
+) -> tuple[Candidates, Tensor, dict[str, int]]:
+    """The pairs in reach of the approach points, a mask of those that no rule drops, and how many each rule does."""
+    approach, contact = pairs_in_reach(cloud, approach_points, config)
+    poses = grasp_poses(cloud.points[approach], cloud.points[contact], cloud.normals[contact])
+    candidates = Candidates(approach, contact, poses)
+    masks = {
+        "from_below": _comes_from_behind(cloud, candidates, config),
+        "approach": _outside_cone(cloud, poses[:, :3, 2], query),
+        "support": hand_clearance(cloud, poses, gripper) < config.support_clearance,
+    }
+    rejected = {}
+    alive = torch.ones(len(candidates), dtype=torch.bool, device=poses.device)
+    for name, bad in masks.items():
+        rejected[name] = int((bad & alive).sum())
+        alive &= ~bad
+    return candidates, alive, rejected
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
@@ -163,14 +178,12 @@ def hand_clearance(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gr
     """(C,) metres between the support plane and the lowest corner of the open hand; infinite without a plane."""
     if cloud.up is None or cloud.support_height is None:
         return torch.full((len(Ts_canonical_grasp),), math.inf, device=Ts_canonical_grasp.device)
-    centres, half_extents = (
-        torch.tensor(array, dtype=Ts_canonical_grasp.dtype, device=Ts_canonical_grasp.device)
-        for array in gripper.boxes(gripper.max_width)
+    corners = torch.tensor(
+        gripper.corners(gripper.max_width), dtype=Ts_canonical_grasp.dtype, device=Ts_canonical_grasp.device
     )
     up_in_grasp = (Ts_canonical_grasp[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
     tcp_height = Ts_canonical_grasp[:, :3, 3] @ cloud.up - cloud.support_height
-    lowest = up_in_grasp @ centres.T - up_in_grasp.abs() @ half_extents.T
-    return tcp_height + lowest.min(dim=1).values
+    return tcp_height + (up_in_grasp @ corners.T).min(dim=1).values
 
 
 def _comes_from_behind(cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig) -> Tensor:

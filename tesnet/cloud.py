@@ -29,7 +29,8 @@ class PreparationConfig:
         voxel_size: edge of the grid's cells.
         outlier_neighbours, outlier_std_ratio: a point whose mean distance to that many neighbours exceeds the
             cloud's mean by more than the ratio times the standard deviation is dropped.
-        normal_neighbours, normal_radius: points that a normal is fitted to, the point itself included.
+        normal_neighbours, normal_radius: points that a normal is fitted to, the point itself included. More would blur
+            the low walls of flat objects, whose normals then tilt the hand into the table.
         graph_neighbours: k of the kNN graph, the point itself included.
         max_points: larger prepared clouds are cropped to the points nearest their median.
         max_extent: points farther than this from the median of the cloud are ignored.
@@ -38,7 +39,7 @@ class PreparationConfig:
     voxel_size: float = 0.0045
     outlier_neighbours: int = 20
     outlier_std_ratio: float = 3.0
-    normal_neighbours: int = 30
+    normal_neighbours: int = 14
     normal_radius: float = 0.03
     graph_neighbours: int = 16
     max_points: int = 12_000
@@ -194,21 +195,48 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
 
     Queries default to the points themselves; each is then its own first neighbour. With fewer than k points the last
     one is repeated.
+
+    Points and queries are sorted along x, and a block of queries is compared with the slab of points around it only;
+    the few queries whose k-th neighbour may lie outside the slab are compared with all points.
     """
     sources = points if queries is None else queries
     available = min(k, len(points))
-    rows = max(1, 4_000_000 // max(1, len(points)))
-    # Squared distances up to a constant a row: float64, or the expanded square would cancel far from the origin.
-    exact = points.double()
-    lengths = exact.square().sum(dim=1)
-    blocks = [
-        torch.addmm(lengths, block.double(), exact.T, alpha=-2).float().topk(available, largest=False).indices
-        for block in sources.split(rows)
-    ]
-    neighbours = torch.cat(blocks)
+    # Squared distances come from an expanded square, whose terms cancel: float64.
+    exact, wanted = points.double(), sources.double()
+    by_x, order = exact[:, 0].sort()
+    sorted_points = exact[order]
+    query_order = wanted[:, 0].argsort()
+    neighbours = torch.empty(len(sources), available, dtype=torch.long, device=points.device)
+    unsure = []
+    for rows in query_order.split(_SLAB_QUERIES):
+        block = wanted[rows]
+        ends = torch.stack([block[0, 0] - _SLAB_MARGIN, block[-1, 0] + _SLAB_MARGIN])
+        first, last = torch.searchsorted(by_x, ends).tolist()
+        if last - first < available:
+            unsure.append(rows)
+            continue
+        squares, found = _nearest(block, sorted_points[first:last], available)
+        neighbours[rows] = order[found + first]
+        unsure.append(rows[squares[:, -1] >= _SLAB_MARGIN**2])
+    for rows in torch.cat(unsure).split(max(1, _LARGEST_TABLE // len(points))) if unsure else ():
+        neighbours[rows] = _nearest(wanted[rows], exact, available)[1]
     if queries is None:
         neighbours = _self_first(neighbours)
     return neighbours if available == k else torch.cat([neighbours, neighbours[:, -1:].expand(-1, k - available)], 1)
+
+
+_SLAB_QUERIES = 192
+_SLAB_MARGIN = 0.02
+_LARGEST_TABLE = 4_000_000
+
+
+def _nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Squared distances and indices (Q, k) of the nearest points, both in ascending order of distance."""
+    # |q - p|^2 = [q, |q|^2, 1] . [-2 p, 1, |p|^2]; only the sum is small enough for float32.
+    left = torch.cat([queries, queries.square().sum(dim=1, keepdim=True), torch.ones_like(queries[:, :1])], dim=1)
+    right = torch.cat([-2 * points, torch.ones_like(points[:, :1]), points.square().sum(dim=1, keepdim=True)], dim=1)
+    nearest = (left @ right.T).float().topk(k, largest=False)
+    return nearest.values, nearest.indices
 
 
 def _self_first(neighbours: Tensor) -> Tensor:
@@ -277,8 +305,8 @@ def smallest_eigenvector(symmetric: Tensor) -> tuple[Tensor, Tensor]:
     """Ascending eigenvalues (B, 3) and the unit eigenvector (B, 3) of the smallest, of symmetric matrices (B, 3, 3).
 
     Eigenvalues by the trigonometric solution of the characteristic polynomial (Smith 1961, "Eigenvalues of a
-    symmetric 3 x 3 matrix"); the eigenvector is the longest cross product of two rows of A - lambda I. A matrix
-    without a distinct smallest eigenvalue yields some unit vector.
+    symmetric 3 x 3 matrix"); the eigenvector is the longest cross product of two rows of A - lambda I. Where the
+    smallest eigenvalue is not distinct, it is some unit vector of its eigenspace.
     """
     identity = torch.eye(3, dtype=symmetric.dtype, device=symmetric.device)
     scale = symmetric.abs().amax(dim=(1, 2)).clamp(min=torch.finfo(symmetric.dtype).tiny)
@@ -297,8 +325,14 @@ def smallest_eigenvector(symmetric: Tensor) -> tuple[Tensor, Tensor]:
     best = lengths.argmax(dim=1)
     rows = torch.arange(len(a), device=a.device)
     vector, length = products[rows, best], lengths[rows, best]
-    degenerate = length < 1e-14
-    vector = torch.where(degenerate[:, None], identity[2].expand_as(vector), vector / length.clamp(min=1e-300)[:, None])
+    # With two equal eigenvalues every row is a multiple of the third eigenvector, and any vector across it is right.
+    row = shifted[rows, shifted.norm(dim=2).argmax(dim=1)]
+    across = torch.linalg.cross(row, identity[row.abs().argmin(dim=1)], dim=1)
+    across_length = across.norm(dim=1)
+    fallback = torch.where(
+        (across_length < 1e-14)[:, None], identity[2], across / across_length.clamp(min=1e-300)[:, None]
+    )
+    vector = torch.where((length < 1e-14)[:, None], fallback, vector / length.clamp(min=1e-300)[:, None])
     return eigenvalues.clamp(min=0) * scale[:, None], vector
 
 

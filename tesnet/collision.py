@@ -15,6 +15,7 @@ SHADOW_MARGIN = 0.01
 """A place is hidden when it lies this far behind the surface that covers it."""
 
 _BLOCK = 4_000_000
+_COARSE_STRIDE = 6
 
 
 def in_collision(
@@ -25,31 +26,43 @@ def in_collision(
     Args:
         cloud: P observed points.
         Ts_canonical_grasp: (C, 4, 4) TCP poses.
-        gripper: the hand; palm and fingers are boxes.
+        gripper: the hand.
         width: opening of the fingers.
         approach_distance: length of the straight approach, which ends in the grasp.
     """
-    rows = max(1, _BLOCK // max(1, len(cloud)))
-    blocks = [_hit(cloud.points, poses, gripper, width, approach_distance) for poses in Ts_canonical_grasp.split(rows)]
-    return torch.cat(blocks) if blocks else torch.zeros(0, dtype=torch.bool, device=cloud.points.device)
+    hit = torch.zeros(len(Ts_canonical_grasp), dtype=torch.bool, device=cloud.points.device)
+    # Most collisions show with a few points already; the others are looked for with all of them.
+    for points in (cloud.points[::_COARSE_STRIDE], cloud.points):
+        open_rows = (~hit).nonzero()[:, 0]
+        for rows in open_rows.split(max(1, _BLOCK // max(1, len(points)))):
+            hit[rows] = _hit(points, Ts_canonical_grasp[rows], gripper, width, approach_distance)
+    return hit
 
 
 def _hit(points: Tensor, poses: Tensor, gripper: Gripper, width: float, approach_distance: float) -> Tensor:
     x, y, z = points_in_grasp_frames(points, poses)
     x, y = x.abs_(), y.abs_()
-    palm_front = gripper.tip_offset - gripper.finger_length
+    # Swept along z, a tapered body is as wide at each place as where it comes to rest.
+    finger_slope = (gripper.finger_thickness - gripper.finger_tip_thickness) / gripper.finger_taper
+    thickness = ((gripper.tip_offset - z) * finger_slope + gripper.finger_tip_thickness).clamp_(
+        max=gripper.finger_thickness
+    )
     fingers = (
         (y > width / 2)
-        & (y < width / 2 + gripper.finger_thickness)
+        & (y < thickness + width / 2)
         & (x < gripper.finger_breadth / 2)
         & (z < gripper.tip_offset)
-        & (z > palm_front - approach_distance)
+        & (z > gripper.palm_front - approach_distance)
+    )
+    palm_slope = (gripper.palm_breadth - gripper.palm_front_breadth) / 2 / gripper.palm_taper
+    half_breadth = ((gripper.palm_front - z) * palm_slope + gripper.palm_front_breadth / 2).clamp_(
+        max=gripper.palm_breadth / 2
     )
     palm = (
-        (z < palm_front)
-        & (x < gripper.palm_breadth / 2)
+        (z < gripper.palm_front)
+        & (x < half_breadth)
         & (y < gripper.palm_length / 2)
-        & (z > palm_front - gripper.palm_depth - approach_distance)
+        & (z > gripper.palm_front - gripper.palm_depth - approach_distance)
     )
     return (fingers | palm).any(dim=1)
 
@@ -77,10 +90,14 @@ def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper
 
 
 def _hand_samples(gripper: Gripper, width: float) -> list[list[float]]:
-    palm_front = gripper.tip_offset - gripper.finger_length
+    palm_front = gripper.palm_front
     depths = [palm_front + gripper.finger_length * step / 4 for step in range(5)]
-    finger_ys = [width / 2 + gripper.finger_thickness * share for share in (0.1, 0.5, 0.9)]
-    fingers = [[0.0, side * y, z] for side in (-1, 1) for y in finger_ys for z in depths]
+    fingers = [
+        [0.0, side * (width / 2 + share * gripper.finger_thickness_at(gripper.tip_offset - z)), z]
+        for side in (-1, 1)
+        for share in (0.1, 0.5, 0.9)
+        for z in depths
+    ]
     palm = [[0.0, gripper.palm_length / 2 * share, palm_front - 0.005] for share in (-0.9, -0.45, 0.0, 0.45, 0.9)]
     return fingers + palm
 

@@ -18,6 +18,9 @@ from tesnet.networks import Network
 from tesnet.query import GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 
+COARSEST_RESOLUTION = 0.0005
+"""Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
+
 APPROACH_DISTANCE = 0.05
 """Length of the straight approach that is kept clear of observed points, metres."""
 
@@ -118,7 +121,8 @@ class GraspPredictor:
         clock.lap("prepare")
         if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
             count = 0 if prepared is None else len(prepared)
-            reason: Reason = "no_points_in_workspace" if prepared is None else "too_few_points"
+            outside = prepared is None and len(query.points) > 0
+            reason: Reason = "no_points_in_workspace" if outside else "too_few_points"
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
         notes += _cloud_warnings(prepared, self._preparation)
 
@@ -218,6 +222,13 @@ def _query_warnings(query: GraspQuery) -> list[str]:
 
 def _cloud_warnings(prepared: cloud.PreparedCloud, config: cloud.PreparationConfig) -> list[str]:
     notes = []
+    distance = float(np.abs(prepared.T_cloud_canonical.translation).max())
+    resolution = float(np.spacing(np.float32(distance)))
+    if resolution > COARSEST_RESOLUTION:
+        notes.append(
+            f"the cloud lies {distance:.0f} m from the origin of its frame, where coordinates are kept to "
+            f"{resolution * 1000:.2g} mm only: use a frame near the cloud"
+        )
     if prepared.dropped_far:
         notes.append(
             f"{prepared.dropped_far} points farther than {config.max_extent:g} m from the cloud's median were ignored"

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Literal
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
@@ -15,13 +15,22 @@ MAX_APPROACH_POINTS = 1024
 MAX_CANDIDATES = 20_000
 MAX_DIAGONAL = 20.0
 """Metres; a cloud whose central 90 % spans more was not given in metres."""
+MAX_DISTANCE = 1e9
+"""Metres from the origin at which viewpoints and support planes still count as given in metres."""
+
+
+def _numbers(field: str, value: ArrayLike) -> NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "biuf":
+        raise InvalidQuery(field, "is no array of real numbers; give x, y, z in metres")
+    return array
 
 
 def _vector(field: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    try:
-        array = np.array(value, dtype=np.float64)
-    except (TypeError, ValueError):
-        raise InvalidQuery(field, "is no array of numbers; give x, y, z in metres") from None
+    array = np.array(_numbers(field, value), dtype=np.float64)
     if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
         wanted = " x ".join("N" if size == -1 else str(size) for size in shape)
         raise InvalidQuery(field, f"has shape {array.shape}; give an array of {wanted}")
@@ -41,9 +50,19 @@ def _direction(field: str, value: ArrayLike) -> NDArray[np.float64]:
     return direction
 
 
-def _in_range(field: str, value: float, low: float, high: float, unit: str = "") -> None:
+def _in_range(field: str, value: Any, low: float, high: float, unit: str = "") -> None:
+    if not isinstance(value, (int, float, np.number)):
+        raise InvalidQuery(
+            field, f"is of type {type(value).__name__}; give a number between {low:g} and {high:g}{unit}"
+        )
     if not low <= value <= high:
         raise InvalidQuery(field, f"is {value:g}; it must lie between {low:g} and {high:g}{unit}")
+
+
+def _whole_in_range(field: str, value: Any, low: int, high: int) -> None:
+    if not isinstance(value, (int, np.integer)) or not low <= value <= high:
+        shown = value if isinstance(value, (int, float, np.number)) else f"of type {type(value).__name__}"
+        raise InvalidQuery(field, f"is {shown}; it must be a whole number between {low} and {high}")
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -117,31 +136,37 @@ class GraspQuery:
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", _cloud(self.points))
         if self.viewpoints is not None:
-            array = np.asarray(self.viewpoints)
-            viewpoints = array[None] if array.ndim == 1 else array
-            object.__setattr__(self, "viewpoints", _vector("viewpoint", viewpoints, (-1, 3)))
+            array = _numbers("viewpoint", self.viewpoints)
+            viewpoints = _vector("viewpoint", array[None] if array.ndim == 1 else array, (-1, 3))
+            object.__setattr__(self, "viewpoints", viewpoints)
             if not 1 <= len(viewpoints) <= 64:
                 raise InvalidQuery("viewpoint", f"has {len(viewpoints)} positions; give 1 to 64")
+            farthest = float(np.abs(viewpoints).max())
+            _in_range("viewpoint", farthest, 0, MAX_DISTANCE, " m from the origin")
         if self.up is not None:
             object.__setattr__(self, "up", _direction("up", self.up))
         if self.support_height is not None:
             if self.up is None:
                 raise InvalidQuery("support_height", "needs `up`: a height is measured along it; give `up` as well")
-            if not np.isfinite(self.support_height):
-                raise InvalidQuery("support_height", f"is {self.support_height}; give a finite height in metres")
-        _in_range("max_grasps", self.max_grasps, 1, MAX_GRASPS)
+            _in_range("support_height", self.support_height, -MAX_DISTANCE, MAX_DISTANCE, " m")
+        for name, kind in (("workspace", Box), ("approach", ApproachCone)):
+            value = getattr(self, name)
+            if value is not None and not isinstance(value, kind):
+                raise InvalidQuery(name, f"is of type {type(value).__name__}; give a {kind.__name__} or None")
+        _whole_in_range("max_grasps", self.max_grasps, 1, MAX_GRASPS)
         _in_range("min_score", self.min_score, 0, 1)
         _in_range("min_separation", self.separation_translation, 0, 1, " m")
         _in_range("min_separation", self.separation_rotation_deg, 0, 180, " degrees")
-        _in_range("num_approach_points", self.num_approach_points, 1, MAX_APPROACH_POINTS)
-        _in_range("max_candidates", self.max_candidates, 1, MAX_CANDIDATES)
-        _in_range("seed", self.seed, 0, 2**63 - 1)
+        _whole_in_range("num_approach_points", self.num_approach_points, 1, MAX_APPROACH_POINTS)
+        _whole_in_range("max_candidates", self.max_candidates, 1, MAX_CANDIDATES)
+        _whole_in_range("seed", self.seed, 0, 2**63 - 1)
         if self.unseen not in ("free", "occupied"):
             raise InvalidQuery("unseen", f"is {self.unseen!r}; valid: free, occupied")
 
 
 def _cloud(points: ArrayLike) -> NDArray[np.float32]:
-    array = np.array(points, dtype=np.float32)
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
+        array = np.array(_numbers("points", points), dtype=np.float32)
     if array.ndim != 2 or array.shape[1] != 3:
         raise InvalidQuery("points", f"have shape {array.shape}; give an array of N x 3: x, y, z in metres")
     if not np.isfinite(array).all():
@@ -150,8 +175,8 @@ def _cloud(points: ArrayLike) -> NDArray[np.float32]:
             "points", f"{bad} of {len(array)} are NaN or infinite; remove them (a camera marks missing depth so)"
         )
     if len(array):
-        low, high = np.percentile(array, [5, 95], axis=0)
-        diagonal = float(np.linalg.norm(high.astype(np.float64) - low))
+        low, high = np.percentile(array, [5, 95], axis=0, method="nearest").astype(np.float64)
+        diagonal = float(np.linalg.norm(high - low))
         if diagonal > MAX_DIAGONAL:
             raise InvalidQuery(
                 "points",

@@ -40,7 +40,10 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
         support_height=height if keep_up and chance >= WITHHOLD_UP + WITHHOLD_SUPPORT else None,
         T_cloud_canonical=cloud.T_cloud_canonical @ Pose(rotation, rotation @ -centre.double().numpy()).inverse(),
     )
-    return replace(view, cloud=turned)
+    T_turned_cloud = torch.eye(4)
+    T_turned_cloud[:3, :3], T_turned_cloud[:3, 3] = turn, -turn @ centre
+    candidates = replace(view.candidates, Ts_canonical_grasp=T_turned_cloud @ view.candidates.Ts_canonical_grasp)
+    return replace(view, cloud=turned, candidates=candidates)
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

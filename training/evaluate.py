@@ -46,7 +46,7 @@ def score_views(network: Network, views: Sequence[LabelledView]) -> list[tuple[m
     for view in views:
         free = view.collision_free.nonzero()[:, 0]
         if len(free):
-            logits = network.score(network.encode(view.cloud), view.cloud, view.candidates(free))
+            logits = network.score(network.encode(view.cloud), view.cloud, view.candidates.select(free))
             scored.append((logits.double().numpy(), view.success[free].numpy()))
     return scored
 

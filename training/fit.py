@@ -23,7 +23,7 @@ from tesnet.predictor import configuration_of
 from training import metrics
 from training.augment import augment
 from training.evaluate import measure, score_views
-from training.labels import LabelledView, load_views, scene_files
+from training.labels import LabelledView, LabelsError, load_views, scene_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Recipe:
     weight_decay: float = 1e-4
     patience: int = 2
     smallest_learning_rate: float = 5e-5
-    max_epochs: int = 12
+    max_epochs: int = 10
     cosine: bool = True
     views_per_step: int = 4
     candidates_per_view: int = 120
@@ -99,6 +99,11 @@ def fit(
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     train_views = [view for view in load_views(data) if metrics.usable(view.success.numpy())]
+    if not train_views:
+        raise LabelsError(
+            f"no view of the training labels has {metrics.FEWEST_POSITIVES} successes and a failure; "
+            "generate more labels, or with more labels per view"
+        )
     validation_views = list(load_views(validation))
     free = sum(int(view.collision_free.sum()) for view in train_views)
     labels = sum(len(view.outcomes) for view in train_views)
@@ -108,7 +113,8 @@ def fit(
     checkpoint = out.with_suffix(".checkpoint")
     progress = _resume(checkpoint, network, optimiser) or _Progress(learning_rate=recipe.learning_rate)
     last_epoch = min(recipe.max_epochs, epochs or recipe.max_epochs)
-    while progress.epoch < last_epoch and progress.learning_rate >= recipe.smallest_learning_rate:
+    # Only halving ends the training: along the cosine the rate is small at the start, too.
+    while progress.epoch < last_epoch and (recipe.cosine or progress.learning_rate >= recipe.smallest_learning_rate):
         started = time.monotonic()
         loss = _epoch(network, optimiser, recipe, train_views, prior, progress, seed)
         measures = measure(score_views(network, validation_views), seed)
@@ -184,7 +190,7 @@ def _view_loss(
     )
     target = view.success[which]
     mirror = torch.from_numpy(rng.choice([-1.0, 1.0], len(which)).astype(np.float32))
-    logits = network.score(network.encode(view.cloud), view.cloud, view.candidates(which), mirror)
+    logits = network.score(network.encode(view.cloud), view.cloud, view.candidates.select(which), mirror)
     return functional.binary_cross_entropy_with_logits(logits, target.float(), class_weights[target.long()])
 
 

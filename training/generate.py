@@ -197,8 +197,7 @@ def _label_view(
         kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), PANDA.max_width), snapshot)
     return LabelledView(
         cloud=prepared,
-        approach=picked.approach,
-        contact=picked.contact,
+        candidates=picked,
         outcomes=torch.tensor([OUTCOMES.index(kind) for kind in kinds], dtype=torch.uint8),
         collision_free=free[which],
         scene=config.scene,

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import os
+import zipfile
 from collections.abc import Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
@@ -14,7 +15,7 @@ import torch
 from numpy.typing import NDArray
 
 from tesnet.candidates import Candidates, grasp_poses
-from tesnet.cloud import PreparedCloud
+from tesnet.cloud import PreparationConfig, PreparedCloud, estimate_normals, orient_normals
 from tesnet.geometry import Pose
 
 OUTCOMES = ("success", "pregrasp", "approach", "slip", "drop")
@@ -31,15 +32,14 @@ class LabelledView:
 
     Args:
         cloud: in its canonical frame.
-        approach, contact: (C,) indices into the cloud.
+        candidates: C pairs of the cloud, with the poses that were tried.
         outcomes: (C,) codes into `OUTCOMES`.
         collision_free: (C,) whether the observed cloud left the hand's way free: such candidates the service scores.
         scene: kind of the scene, `packed` or `pile`.
     """
 
     cloud: PreparedCloud
-    approach: torch.Tensor
-    contact: torch.Tensor
+    candidates: Candidates
     outcomes: torch.Tensor
     collision_free: torch.Tensor
     scene: str
@@ -48,14 +48,6 @@ class LabelledView:
     def success(self) -> torch.Tensor:
         """(C,) bool."""
         return self.outcomes == 0
-
-    def candidates(self, which: torch.Tensor) -> Candidates:
-        """The candidates at indices (K,), with their poses."""
-        approach, contact = self.approach[which], self.contact[which]
-        points = self.cloud.points
-        return Candidates(
-            approach, contact, grasp_poses(points[approach], points[contact], self.cloud.normals[contact])
-        )
 
 
 def save_scene(
@@ -79,10 +71,9 @@ def save_scene(
             f"{number}/frame": np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8),
             f"{number}/points": cloud.points.numpy().astype(np.float16),
             f"{number}/normals": cloud.normals.numpy().astype(np.float16),
-            f"{number}/spectrum": cloud.spectrum.numpy().astype(np.float16),
             f"{number}/neighbours": cloud.neighbours.numpy().astype(np.uint16),
-            f"{number}/approach": view.approach.numpy().astype(np.uint16),
-            f"{number}/contact": view.contact.numpy().astype(np.uint16),
+            f"{number}/approach": view.candidates.approach.numpy().astype(np.uint16),
+            f"{number}/contact": view.candidates.contact.numpy().astype(np.uint16),
             f"{number}/outcomes": view.outcomes.numpy().astype(np.uint8),
             f"{number}/collision_free": view.collision_free.numpy(),
         }
@@ -104,7 +95,7 @@ def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
         description = json.loads(arrays["description"].tobytes())
         count = sum(name.endswith("/frame") for name in arrays)
         return description, [_view(arrays, number) for number in range(count)]
-    except (OSError, ValueError, KeyError, EOFError) as error:
+    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
         raise LabelsError(f"{path} holds no labelled scene ({error}); remove it and generate again") from error
 
 
@@ -116,16 +107,20 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
         return torch.from_numpy(array.astype(np.int64) if array.dtype == np.uint16 else array).to(dtype)
 
     points = tensor("points", torch.float32)
+    neighbours = tensor("neighbours", torch.long)
     viewpoints = torch.tensor(frame["viewpoints"])
-    normals = torch.nn.functional.normalize(tensor("normals", torch.float32), dim=1)
-    directions = torch.nn.functional.normalize(viewpoints[None] - points[:, None], dim=2)
-    best = (directions * normals[:, None]).sum(dim=2).argmax(dim=1)
+    approach, contact = tensor("approach", torch.long), tensor("contact", torch.long)
+    tried = torch.nn.functional.normalize(tensor("normals", torch.float32), dim=1)[contact]
+    # Labels belong to the poses that were tried; what the network is shown is prepared as the service does it today.
+    config = PreparationConfig()
+    normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
+    normals, view_directions = orient_normals(points, normals, viewpoints)
     cloud = PreparedCloud(
         points=points,
         normals=normals,
-        neighbours=tensor("neighbours", torch.long),
-        spectrum=tensor("spectrum", torch.float32),
-        view_directions=directions[torch.arange(len(points)), best],
+        neighbours=neighbours,
+        spectrum=spectrum,
+        view_directions=view_directions,
         viewpoints=viewpoints,
         up=None if frame["up"] is None else torch.tensor(frame["up"]),
         support_height=frame["support_height"],
@@ -133,8 +128,7 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     )
     return LabelledView(
         cloud=cloud,
-        approach=tensor("approach", torch.long),
-        contact=tensor("contact", torch.long),
+        candidates=Candidates(approach, contact, grasp_poses(points[approach], points[contact], tried)),
         outcomes=tensor("outcomes", torch.uint8),
         collision_free=tensor("collision_free", torch.bool),
         scene=frame["scene"],

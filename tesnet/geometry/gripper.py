@@ -16,15 +16,19 @@ class Gripper:
     """A two-finger parallel hand, metres, in its grasp frame.
 
     The frame's origin is the TCP, midway between the finger pads; +z is the direction of travel, +y the closing
-    direction. Defaults are the Franka hand's.
+    direction. Fingers are prisms whose outer face tapers towards the tip; the palm is a box whose sides taper towards
+    the fingers. Defaults are the Franka hand's, measured on the convex hulls of its published collision meshes.
 
     Args:
         max_width: largest opening between the pads.
         finger_depth: usable length of the fingers, measured back from the tips.
-        finger_thickness: extent of one finger along y.
-        finger_breadth: extent of one finger along x.
+        finger_thickness, finger_tip_thickness: extent of one finger along y, at its root and at its tip.
+        finger_taper: length of the taper, measured back from the tip.
+        finger_breadth, finger_tip_breadth: extent of one finger along x, and at its very tip.
         tip_offset: distance of the fingertips beyond the TCP along z.
-        palm_depth, palm_breadth, palm_length: extents of the hand's body along z, x and y.
+        palm_depth, palm_length: extents of the hand's body along z and y.
+        palm_breadth, palm_front_breadth: its extent along x, largest and at the fingers.
+        palm_taper: length of its taper, measured back from the fingers.
 
     Raises:
         ValueError: a length that is not positive.
@@ -32,38 +36,69 @@ class Gripper:
 
     max_width: float = 0.08
     finger_depth: float = 0.05
-    finger_thickness: float = 0.0265
+    finger_thickness: float = 0.0264
+    finger_tip_thickness: float = 0.0144
+    finger_taper: float = 0.038
     finger_breadth: float = 0.021
+    finger_tip_breadth: float = 0.0125
     tip_offset: float = 0.0086
     palm_depth: float = 0.092
-    palm_breadth: float = 0.063
     palm_length: float = 0.204
+    palm_breadth: float = 0.063
+    palm_front_breadth: float = 0.0315
+    palm_taper: float = 0.0625
 
     def __post_init__(self) -> None:
         for name in self.__slots__:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; a gripper's lengths are positive, in metres")
 
-    def boxes(self, width: float) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Centres (3, 3) and half extents (3, 3) of palm, +y finger and -y finger in the grasp frame.
-
-        Args:
-            width: the opening between the pads, metres.
-        """
-        finger_top = self.tip_offset - self.finger_length
-        finger_z = (self.tip_offset + finger_top) / 2
-        finger_y = width / 2 + self.finger_thickness / 2
-        centres = np.array(
-            [[0, 0, finger_top - self.palm_depth / 2], [0, finger_y, finger_z], [0, -finger_y, finger_z]]
-        )
-        finger = [self.finger_breadth / 2, self.finger_thickness / 2, self.finger_length / 2]
-        palm = [self.palm_breadth / 2, self.palm_length / 2, self.palm_depth / 2]
-        return centres, np.array([palm, finger, finger])
-
     @property
     def finger_length(self) -> float:
         """Metres from the hand's body to the fingertips; the body reaches 4 mm into the usable finger depth."""
         return self.finger_depth - 0.004
+
+    @property
+    def palm_front(self) -> float:
+        """Where, along z, the palm's face between the fingers lies."""
+        return self.tip_offset - self.finger_length
+
+    def corners(self, width: float) -> NDArray[np.float64]:
+        """Extreme points (K, 3) of the hand in the grasp frame; their convex hull contains each finger and the palm.
+
+        Args:
+            width: the opening between the pads, metres.
+        """
+        tip, root = self.tip_offset, self.palm_front
+        taper = tip - self.finger_taper
+        # The tip is rounded over its last 7 mm.
+        finger = [
+            (self.finger_tip_breadth, self.finger_tip_thickness, tip),
+            (self.finger_breadth, self.finger_thickness_at(0.007), tip - 0.007),
+            (self.finger_breadth, self.finger_thickness, taper),
+            (self.finger_breadth, self.finger_thickness, root),
+        ]
+        palm = [
+            (self.palm_front_breadth, self.palm_length, root),
+            (self.palm_breadth, self.palm_length, root - self.palm_taper),
+            (self.palm_breadth, self.palm_length, root - self.palm_depth),
+        ]
+        points = [
+            (side_x * breadth / 2, side_y * y, z)
+            for breadth, thickness, z in finger
+            for y in (width / 2, width / 2 + thickness)
+            for side_x in (-1, 1)
+            for side_y in (-1, 1)
+        ]
+        points += [
+            (sx * breadth / 2, sy * length / 2, z) for breadth, length, z in palm for sx in (-1, 1) for sy in (-1, 1)
+        ]
+        return np.array(points)
+
+    def finger_thickness_at(self, behind_tip: float) -> float:
+        """Extent of one finger along y at a distance behind its tip, metres."""
+        share = min(1.0, behind_tip / self.finger_taper)
+        return self.finger_tip_thickness + share * (self.finger_thickness - self.finger_tip_thickness)
 
 
 PANDA = Gripper()

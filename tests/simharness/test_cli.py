@@ -368,3 +368,26 @@ def test_a_service_of_ours_that_dies_in_mid_run_is_reported_with_its_last_words(
     assert "the stub dies as it was told" in errors
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["complete"], report["rounds"]) == (False, 1)
+
+
+def test_weights_that_are_missing_are_named(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
+) -> None:
+    monkeypatch.setenv("GRASP_WEIGHTS", str(tmp_path / "missing.safetensors"))
+    assert main(["--rounds", "1", "--out", str(tmp_path / "out")]) == 3
+    assert "missing.safetensors" in capsys.readouterr().err
+
+
+@pytest.mark.slow
+def test_tables_are_cleared_through_the_real_service(service_url: str, tmp_path: Path) -> None:
+    done = run_it("--rounds", 2, "--scene", "packed", "--url", service_url, "--out", tmp_path)
+    assert done.returncode == 0, done.stderr
+    report = json.loads((tmp_path / "report.json").read_text())
+    attempts = lines(tmp_path / "attempts.jsonl")
+    served = httpx.get(service_url + "/model", trust_env=False).json()["models"][0]
+    assert report["complete"] is True
+    assert report["model"] == {name: served[name] for name in ("name", "version", "weights_sha256")}
+    assert report["successes"] >= 1
+    assert all(0 <= attempt["score"] <= 1 for attempt in attempts)
+    assert all(attempt["counts"]["candidates"] > 0 for attempt in attempts)
+    assert report["latencies"]["service_total_ms"]["median"] > 0

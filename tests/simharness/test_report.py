@@ -292,5 +292,5 @@ def test_a_close_up_holds_the_middle_of_the_table() -> None:
     image = np.zeros((480, 640, 3), np.uint8)
     image[240, 320] = 255
     part = close_up(image, camera, intrinsics)
-    assert part.shape == (300, 400, 3)
-    assert part[150, 200].tolist() == [255] * 3
+    assert part.shape == (240, 320, 3)
+    assert part[120, 160].tolist() == [255] * 3

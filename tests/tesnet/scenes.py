@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,7 @@ import torch
 from numpy.typing import NDArray
 
 from tesnet import cloud, networks
-from tesnet.geometry import CameraIntrinsics, Pose
+from tesnet.geometry import Pose
 from tesnet.networks import Network
 from tesnet.predictor import GraspPredictor, ModelInfo, configuration_of
 from tesnet.query import Box, GraspQuery
@@ -113,6 +114,49 @@ def prepared(query: GraspQuery, **changes: Any) -> cloud.PreparedCloud:
     return found
 
 
+def bare_cloud(points: Array, viewpoints: Array = CAMERA[None], **fields: Any) -> cloud.PreparedCloud:
+    """A prepared cloud of exactly these points (P, 3), in a frame of their own; normals face the first viewpoint."""
+    positions = torch.from_numpy(np.asarray(points)).float()
+    cameras = torch.from_numpy(np.asarray(viewpoints)).float()
+    directions = torch.nn.functional.normalize(cameras[0] - positions, dim=1)
+    given: dict[str, Any] = {
+        "points": positions,
+        "normals": directions,
+        "neighbours": cloud.nearest_neighbours(positions, 16),
+        "spectrum": torch.full((len(positions), 2), 0.1),
+        "view_directions": directions,
+        "viewpoints": cameras,
+        "up": None,
+        "support_height": None,
+        "T_cloud_canonical": Pose.identity(),
+    }
+    return cloud.PreparedCloud(**{**given, **fields})
+
+
+def moved_cloud(ready: cloud.PreparedCloud, motion: Pose) -> cloud.PreparedCloud:
+    """A prepared cloud, moved in its frame with all that belongs to it."""
+    turn, shift = torch.tensor(motion.rotation), torch.tensor(motion.translation)
+
+    def rotate(directions: torch.Tensor) -> torch.Tensor:
+        return (directions.double() @ turn.T).float()
+
+    def move(points: torch.Tensor) -> torch.Tensor:
+        return (points.double() @ turn.T + shift).float()
+
+    up = None if ready.up is None else rotate(ready.up)
+    height = ready.support_height
+    return replace(
+        ready,
+        points=move(ready.points),
+        normals=rotate(ready.normals),
+        view_directions=rotate(ready.view_directions),
+        viewpoints=move(ready.viewpoints),
+        up=up,
+        support_height=None if height is None or up is None else height + float(shift @ up.double()),
+        T_cloud_canonical=ready.T_cloud_canonical @ motion.inverse(),
+    )
+
+
 def fresh_network(seed: int = 0) -> Network:
     """TES-Net with untrained parameters, always the same for a seed."""
     with torch.random.fork_rng():
@@ -126,6 +170,3 @@ def fresh_predictor(seed: int = 0, calibration: tuple[float, float] = (1.0, 0.0)
     configuration = configuration_of(network.config)
     model = ModelInfo("tesnet", "0", "0" * 64, {}, configuration)
     return GraspPredictor(network, configuration, calibration, model, CPU)
-
-
-PINHOLE = CameraIntrinsics(8, 6, 10.0, 12.0, 3.5, 2.5)

@@ -1,0 +1,116 @@
+"""Speed of the whole service over HTTP, with its memory and start-up: `python -m bench.serve --threads 2`.
+
+Starts `python -m service` on a free loopback port and asks it as any Python user would, through `client.GraspClient`,
+whose requests are `application/octet-stream`.
+"""
+
+from __future__ import annotations
+
+import argparse
+import os
+import socket
+import subprocess
+import sys
+import time
+from collections import defaultdict
+from collections.abc import Iterator
+from contextlib import contextmanager
+from pathlib import Path
+
+from bench.scene import SUPPORT_HEIGHT, UP, WORKSPACE_MAXIMUM, WORKSPACE_MINIMUM, five_objects
+from bench.table import processor, table
+from client import GraspClient
+
+READY_WITHIN_S = 60.0
+STOPPED_WITHIN_S = 30.0
+PREDICTOR_STAGES = ("prepare", "candidates", "network", "rank")
+
+
+def free_port() -> int:
+    """A TCP port that was free a moment ago."""
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+@contextmanager
+def running_service(port: int, threads: int) -> Iterator[subprocess.Popen[bytes]]:
+    """`python -m service` on the loopback interface for as long as the context lasts; its log goes to stderr."""
+    environment = os.environ | {
+        "GRASP_HOST": "127.0.0.1",
+        "GRASP_PORT": str(port),
+        "GRASP_DEVICE": "cpu",
+        "GRASP_NUM_THREADS": str(threads),
+        "GRASP_LOG_LEVEL": "warning",
+    }
+    with subprocess.Popen([sys.executable, "-m", "service"], env=environment) as process:
+        try:
+            yield process
+        finally:
+            process.terminate()
+            try:
+                process.wait(STOPPED_WITHIN_S)
+            except subprocess.TimeoutExpired:
+                process.kill()
+
+
+def memory_mb(pid: int, field: str) -> float:
+    """Resident memory of a process, MB: `VmRSS` now, `VmHWM` at its highest. NaN where the system has no /proc."""
+    status = Path(f"/proc/{pid}/status")
+    if status.exists():
+        for line in status.read_text(encoding="utf-8").splitlines():
+            if line.startswith(f"{field}:"):
+                return int(line.split()[1]) * 1024 / 1e6
+    return float("nan")
+
+
+def main() -> None:
+    """Measure and print."""
+    parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
+    parser.add_argument("--threads", type=int, default=2, help="CPU threads of the predictor")
+    parser.add_argument("--runs", type=int, default=50, help="measured requests, after one that is not")
+    parser.add_argument("--points", type=int, default=20_000, help="points in the cloud")
+    parser.add_argument("--candidates", type=int, default=1_500, help="most candidates")
+    arguments = parser.parse_args()
+
+    scene = five_objects(arguments.points)
+    samples: dict[str, list[float]] = defaultdict(list)
+    port = free_port()
+    start = time.perf_counter()
+    with running_service(port, arguments.threads) as process, GraspClient(f"http://127.0.0.1:{port}") as client:
+        client.wait_until_ready(READY_WITHIN_S)
+        ready_s = time.perf_counter() - start
+        ready_memory = memory_mb(process.pid, "VmRSS")
+        for run in range(arguments.runs + 1):
+            start = time.perf_counter()
+            reply = client.grasps(
+                scene.points_world,
+                viewpoint=scene.viewpoint_world,
+                up=UP,
+                workspace={"min": WORKSPACE_MINIMUM, "max": WORKSPACE_MAXIMUM},
+                support_height=SUPPORT_HEIGHT,
+                max_candidates=arguments.candidates,
+            )
+            end_to_end = (time.perf_counter() - start) * 1e3
+            if run == 0:  # the first request opens the connection
+                continue
+            predictor = sum(reply.timings_ms[stage] for stage in PREDICTOR_STAGES)
+            samples["end to end"].append(end_to_end)
+            samples["  in the service"].append(reply.timings_ms["total"])
+            samples["  in the predictor"].append(predictor)
+            samples["overhead over the predictor"].append(end_to_end - predictor)
+        memory, highest = memory_mb(process.pid, "VmRSS"), memory_mb(process.pid, "VmHWM")
+
+    print(f"{processor()}, device cpu, {arguments.threads} threads; application/octet-stream over loopback")
+    print(
+        f"{reply.counts.points} points, {reply.counts.candidates} candidates, {reply.counts.returned} returned; "
+        f"{arguments.runs} requests\n"
+    )
+    print(table(samples))
+    print(f"\ntime to ready    {ready_s:8.2f} s")
+    print(f"memory at ready  {ready_memory:8.0f} MB resident")
+    print(f"memory at end    {memory:8.0f} MB resident, {highest:.0f} MB at its highest")
+
+
+if __name__ == "__main__":
+    main()

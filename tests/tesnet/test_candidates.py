@@ -1,0 +1,257 @@
+from __future__ import annotations
+
+import functools
+import math
+from dataclasses import replace
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tesnet import candidates, cloud
+from tesnet.candidates import CandidateConfig, Candidates
+from tesnet.geometry import PANDA
+from tesnet.query import ApproachCone, GraspQuery
+from tests.tesnet.scenes import CAMERA, UP, Array, bare_cloud, prepared, tabletop, tabletop_query
+
+CONFIG = CandidateConfig()
+ROUNDING = 1e-6
+"""Metres; float32 coordinates of a tenth of a metre are exact to 4e-9."""
+
+
+@functools.cache
+def ready(seed: int = 0) -> cloud.PreparedCloud:
+    return prepared(tabletop_query(seed))
+
+
+def exact(tensor: torch.Tensor) -> Array:
+    return tensor.double().numpy()
+
+
+def generate(options: dict[str, Any] | None = None, seed: int = 0) -> tuple[Candidates, dict[str, int]]:
+    return candidates.generate(ready(seed), tabletop_query(seed, **(options or {})), CONFIG)
+
+
+def farthest_points_one_by_one(points: Array, count: int, start: int) -> list[int]:
+    """Gonzalez 1985, as it stands."""
+    chosen, distance = [start], np.linalg.norm(points - points[start], axis=1)
+    while len(chosen) < count:
+        chosen.append(int(distance.argmax()))
+        distance = np.minimum(distance, np.linalg.norm(points - points[chosen[-1]], axis=1))
+    return chosen
+
+
+def coverage(points: Array, chosen: list[int]) -> float:
+    """The largest distance of a point from its nearest chosen one."""
+    return float(np.linalg.norm(points[:, None] - points[chosen][None], axis=2).min(axis=1).max())
+
+
+# Approach points
+
+
+@given(seed=st.integers(0, 2), count=st.sampled_from([2, 8, 32, 100]), start=st.integers(0, 1000))
+@settings(max_examples=12, deadline=None)
+def test_farthest_points_cover_nearly_as_well_as_one_by_one(seed: int, count: int, start: int) -> None:
+    points = ready(seed).points
+    chosen = candidates.farthest_points(points, count, start).tolist()
+    assert chosen[0] == start
+    assert len(set(chosen)) == count
+    reference = farthest_points_one_by_one(exact(points), count, start)
+    # One by one is at most twice as wide as the best choice there is; this one is held to 2.5 times that.
+    assert coverage(exact(points), chosen) <= 2.5 * coverage(exact(points), reference)
+
+
+def test_no_more_points_are_chosen_than_are_different() -> None:
+    points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0], [0, 2, 0]])
+    assert sorted(map(tuple, points[candidates.farthest_points(points, 5, 2)].tolist())) == [
+        (0.0, 0.0, 0.0),
+        (0.0, 2.0, 0.0),
+        (1.0, 0.0, 0.0),
+    ]
+    assert candidates.farthest_points(points[:1], 8, 0).tolist() == [0]
+    assert candidates.farthest_points(points, 1, 4).tolist() == [4]
+
+
+# Pairs and poses
+
+
+def test_pairs_are_those_of_a_double_loop_over_the_limits() -> None:
+    points, normals = exact(ready().points), exact(ready().normals)
+    approach = candidates.farthest_points(ready().points, 12, 5)
+    found = set(zip(*(index.tolist() for index in candidates.pairs_in_reach(ready(), approach, CONFIG)), strict=True))
+    certain, possible = set(), set()
+    for a in approach.tolist():
+        d = points - points[a]
+        offset = (d * normals).sum(axis=1)
+        distance = np.linalg.norm(d, axis=1)
+        depth = np.linalg.norm(d - offset[:, None] * normals, axis=1)
+        margins = np.stack([0.038 - distance, depth - 0.003, 0.040 - depth, offset + 0.003, 0.038 - offset])
+        certain |= {(a, int(c)) for c in np.flatnonzero(margins.min(axis=0) > ROUNDING)}
+        possible |= {(a, int(c)) for c in np.flatnonzero(margins.min(axis=0) > -ROUNDING)}
+    assert len(certain) > 300
+    assert certain <= found <= possible
+
+
+def assert_within_limits(cloud_: cloud.PreparedCloud, found: Candidates) -> None:
+    """Every limit of CONVENTIONS.md, in float64, by formulas of the test's own."""
+    p_a, p_c = exact(cloud_.points[found.approach]), exact(cloud_.points[found.contact])
+    n_c = exact(cloud_.normals[found.contact])
+    Ts = exact(found.Ts_canonical_grasp)
+    x, y, z, tcp = (Ts[:, :3, column] for column in range(4))
+    d = p_c - p_a
+    offset = np.einsum("ij,ij->i", d, n_c)
+    across = d - offset[:, None] * n_c
+    depth = np.linalg.norm(across, axis=1)
+    assert (np.linalg.norm(d, axis=1) <= 0.038 + ROUNDING).all()
+    assert ((0.003 - ROUNDING <= depth) & (depth <= 0.040 + ROUNDING)).all()
+    assert ((-0.003 - ROUNDING <= offset) & (offset <= 0.038 + ROUNDING)).all()
+    np.testing.assert_allclose(z, across / depth[:, None], atol=2e-5)  # a depth of 3 mm, points to 2e-8 m
+    np.testing.assert_allclose(y, n_c, atol=2e-5)
+    np.testing.assert_allclose(x, np.cross(y, z), atol=1e-6)
+    # The fingertips, 8.6 mm beyond the TCP, stop 7 mm past the depth of p_c on the line through p_a.
+    np.testing.assert_allclose(tcp + 0.0086 * z, p_a + (depth[:, None] + 0.007) * z, atol=ROUNDING)
+    np.testing.assert_allclose(
+        tcp - 0.1034 * z, p_a - (0.105 - depth[:, None]) * z, atol=3e-4
+    )  # the page rounds 0.1050
+    np.testing.assert_allclose(Ts[:, 3], np.tile([0.0, 0, 0, 1], (len(Ts), 1)))
+    np.testing.assert_allclose(
+        Ts[:, :3, :3].transpose(0, 2, 1) @ Ts[:, :3, :3], np.tile(np.eye(3), (len(Ts), 1, 1)), atol=1e-6
+    )
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_candidate_breaks_a_limit_of_the_conventions(seed: int) -> None:
+    found, _ = generate({"max_candidates": 20_000}, seed)
+    assert len(found) > 500
+    assert_within_limits(ready(seed), found)
+    up = ready(seed).up
+    assert up is not None
+    z_upward = exact(found.Ts_canonical_grasp)[:, :3, 2] @ exact(up)
+    assert z_upward.max() < 0.1 + ROUNDING
+    assert lowest_corner(ready(seed), found).min() >= 0.004 - ROUNDING
+
+
+def lowest_corner(cloud_: cloud.PreparedCloud, found: Candidates) -> Array:
+    """(C,) height over the support of the lowest of the open hand's corners, in float64."""
+    assert cloud_.up is not None
+    assert cloud_.support_height is not None
+    Ts = exact(found.Ts_canonical_grasp)
+    places = np.einsum("cij,kj->cki", Ts[:, :3, :3], PANDA.corners(0.08)) + Ts[:, None, :3, 3]
+    lowest: Array = (places @ exact(cloud_.up)).min(axis=1) - cloud_.support_height
+    return lowest
+
+
+def test_hand_clearance_is_that_of_the_lowest_corner() -> None:
+    found, _ = candidates.generate(ready(), tabletop_query(), CandidateConfig(support_clearance=-1.0))
+    clearance = exact(candidates.hand_clearance(ready(), found.Ts_canonical_grasp, PANDA))
+    np.testing.assert_allclose(clearance, lowest_corner(ready(), found), atol=ROUNDING)
+    assert clearance.min() < 0 < clearance.max()
+
+
+def test_without_a_support_nothing_is_too_low() -> None:
+    query = GraspQuery(tabletop(0), viewpoints=CAMERA, up=UP)
+    found, rejected = candidates.generate(prepared(query), query, CONFIG)
+    assert rejected["support"] == 0
+    assert torch.isinf(candidates.hand_clearance(prepared(query), found.Ts_canonical_grasp, PANDA)).all()
+
+
+def test_without_up_nothing_comes_from_behind_what_is_seen() -> None:
+    query = GraspQuery(tabletop(0), viewpoints=CAMERA)
+    ready_ = prepared(query)
+    found, rejected = candidates.generate(ready_, query, CONFIG)
+    towards_camera = exact(ready_.viewpoints[0]) - exact(ready_.points[found.approach])
+    towards_camera /= np.linalg.norm(towards_camera, axis=1, keepdims=True)
+    z = exact(found.Ts_canonical_grasp)[:, :3, 2]
+    assert np.einsum("ij,ij->i", z, towards_camera).max() < 0.1 + ROUNDING
+    assert rejected["from_below"] > 0
+
+
+@pytest.mark.parametrize("angle", [0.0, 25.0, 90.0, 180.0])
+def test_the_approach_cone_keeps_exactly_what_travels_within_it(angle: float) -> None:
+    direction = np.array([0.3, 0.2, -1.0])
+    found, rejected = every_candidate(approach=ApproachCone(direction, angle))
+    everything, _ = every_candidate()
+    z = exact(everything.Ts_canonical_grasp)[:, :3, 2] @ coarse().T_cloud_canonical.rotation.T
+    inside = np.degrees(np.arccos(np.clip(z @ direction / np.linalg.norm(direction), -1, 1)))
+    # The mask allows 1e-6 of the cosine: 0.1 degrees at the tip of the cone, nothing to speak of elsewhere.
+    assert (inside <= angle - 0.1).sum() <= len(found) <= (inside <= angle + 0.1).sum()
+    assert (rejected["approach"] == 0) == (angle == 180.0)
+
+
+# The account
+
+
+@functools.cache
+def coarse() -> cloud.PreparedCloud:
+    """A cloud so small that every point can be an approach point."""
+    return prepared(tabletop_query(), voxel_size=0.014)
+
+
+def every_candidate(config: CandidateConfig = CONFIG, **options: Any) -> tuple[Candidates, dict[str, int]]:
+    query = tabletop_query(**{"num_approach_points": 1024, "max_candidates": 20_000, **options})
+    return candidates.generate(coarse(), query, config)
+
+
+def test_every_pair_is_a_candidate_or_counted_as_rejected() -> None:
+    assert len(coarse()) < 1024
+    found, rejected = every_candidate(approach=ApproachCone(-UP, 60.0))
+    pairs, none = every_candidate(CandidateConfig(max_upward=2.0, support_clearance=-1.0))
+    assert set(rejected) == {"support", "from_below", "approach"}
+    assert min(rejected.values()) > 0
+    assert none == dict.fromkeys(rejected, 0)
+    assert len(found) + sum(rejected.values()) == len(pairs) < 20_000
+
+
+def test_more_approach_points_are_tried_while_there_are_too_few_candidates() -> None:
+    few, _ = generate({"num_approach_points": 1, "max_candidates": 1})
+    many, _ = generate({"num_approach_points": 1, "max_candidates": 400})
+    assert len(few) == 1
+    assert 200 <= len(many) <= 400
+    assert len(set(many.approach.tolist())) > 1
+
+
+@pytest.mark.parametrize("limit", [1, 7, 300])
+def test_at_most_max_candidates_are_kept_a_random_choice(limit: int) -> None:
+    found, _ = every_candidate()
+    few, _ = every_candidate(max_candidates=limit)
+    pairs, chosen = (set(zip(c.approach.tolist(), c.contact.tolist(), strict=True)) for c in (found, few))
+    assert len(chosen) == limit
+    assert chosen <= pairs
+
+
+def test_the_same_seed_gives_the_same_candidates_and_another_seed_others() -> None:
+    queries = [replace(tabletop_query(), seed=seed) for seed in (3, 3, 4)]
+    first, second, other = (candidates.generate(ready(), query, CONFIG)[0] for query in queries)
+    assert torch.equal(first.Ts_canonical_grasp, second.Ts_canonical_grasp)
+    assert set(first.approach.tolist()) != set(other.approach.tolist())
+
+
+def test_candidates_are_selected_by_index_and_by_mask() -> None:
+    found, _ = generate()
+    mask = torch.arange(len(found)) % 3 == 0
+    by_mask, by_index = found.select(mask), found.select(mask.nonzero()[:, 0])
+    assert len(by_mask) == int(mask.sum())
+    assert torch.equal(by_mask.Ts_canonical_grasp, by_index.Ts_canonical_grasp)
+    assert torch.equal(by_mask.contact, found.contact[mask])
+
+
+def test_points_too_far_apart_make_no_pair() -> None:
+    sparse = bare_cloud(np.random.default_rng(0).permutation(40)[:, None] * np.array([0.05, 0.0, 0.0]))
+    found, _ = candidates.generate(sparse, GraspQuery(np.zeros((1, 3))), CONFIG)
+    assert len(found) == 0
+    assert found.Ts_canonical_grasp.shape == (0, 4, 4)
+
+
+def test_the_axes_of_one_pair_are_those_drawn_in_the_conventions() -> None:
+    """An approach point on a top face and a contact point 2 cm lower on the side that faces +y."""
+    poses = candidates.grasp_poses(
+        torch.tensor([[0.0, 0.0, 0.1]]), torch.tensor([[0.0, 0.03, 0.08]]), torch.tensor([[0.0, 1.0, 0.0]])
+    )
+    np.testing.assert_allclose(poses[0, :3, 2], [0, 0, -1], atol=1e-7)
+    np.testing.assert_allclose(poses[0, :3, 1], [0, 1, 0], atol=1e-7)
+    np.testing.assert_allclose(poses[0, :3, 0], [-1, 0, 0], atol=1e-7)
+    np.testing.assert_allclose(poses[0, :3, 3], [0, 0, 0.1 - (0.02 - 0.0016)], atol=1e-7)
+    assert math.isclose(CONFIG.max_pair_distance, 0.038)

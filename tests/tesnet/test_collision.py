@@ -1,0 +1,176 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tesnet import candidates, collision
+from tesnet.geometry import PANDA, Pose
+from tests.tesnet.scenes import Array, bare_cloud, prepared, random_motion, tabletop_query
+
+ROUNDING = 1e-6
+SWEEP = 0.05
+
+
+def depths(points: Array, T: Array, width: float) -> Array:
+    """(P,) how deep, in metres, points lie in the resting hand, by the Panda's measures; negative outside."""
+    local = (points - T[:3, 3]) @ T[:3, :3]
+    x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
+    thickness = np.interp(0.0086 - z, [0, 0.038], [0.0144, 0.0264])
+    finger = [y - width / 2, width / 2 + thickness - y, 0.0105 - x, 0.0086 - z, z + 0.0374]
+    breadth = np.interp(-0.0374 - z, [0, 0.0625], [0.0315, 0.063])
+    palm = [breadth / 2 - x, 0.102 - y, -0.0374 - z, z + 0.0374 + 0.092]
+    deepest: Array = np.maximum(np.min(finger, axis=0), np.min(palm, axis=0))
+    return deepest
+
+
+def penetration(points: Array, Ts: Array, width: float, sweep: float = SWEEP) -> Array:
+    """(C,) of the deepest point at any of the steps, a millimetre apart, of the way to the grasp. float64, loops."""
+    deepest = np.full(len(Ts), -np.inf)
+    for row, T in enumerate(Ts):
+        for back in np.linspace(0, sweep, 51 if sweep else 1):
+            behind = T.copy()
+            behind[:3, 3] -= back * T[:3, 2]
+            deepest[row] = max(deepest[row], depths(points, behind, width).max())
+    return deepest
+
+
+def assert_agree(found: Array, depth: Array) -> None:
+    """Between two steps of the twin the hand moves by 1 mm, so a point may graze it by that much unnoticed."""
+    assert found[depth > ROUNDING].all()
+    assert not found[depth < -0.001].any()
+
+
+def hits(points: Array, Ts: Array, width: float, sweep: float = SWEEP) -> Array:
+    found = collision.in_collision(bare_cloud(points), torch.from_numpy(Ts).float(), PANDA, width, sweep)
+    return np.asarray(found.numpy())
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    count=st.sampled_from([1, 5, 40]),
+    width=st.sampled_from([0.0, 0.04, 0.08]),
+    sweep=st.sampled_from([0.0, 0.05]),
+)
+@settings(max_examples=15, deadline=None)
+def test_collision_is_that_of_a_brute_force_twin(seed: int, count: int, width: float, sweep: float) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.12, 0.12, (count, 3)).astype(np.float32).astype(np.float64)
+    Ts = np.array([random_motion(rng, reach=0.08).matrix for _ in range(20)])
+    depth, found = penetration(points, Ts, width, sweep), hits(points, Ts, width, sweep)
+    assert_agree(found, depth)
+    if not sweep:  # one step is the whole way
+        certain = np.abs(depth) > ROUNDING
+        np.testing.assert_array_equal(found[certain], depth[certain] > 0)
+
+
+def test_the_candidates_of_a_scene_collide_as_the_twin_says() -> None:
+    ready = prepared(tabletop_query())
+    found, _ = candidates.generate(ready, tabletop_query(max_candidates=150), candidates.CandidateConfig())
+    hit = collision.in_collision(ready, found.Ts_canonical_grasp, PANDA, 0.08, SWEEP).numpy()
+    assert_agree(hit, penetration(ready.points.double().numpy(), found.Ts_canonical_grasp.double().numpy(), 0.08))
+    assert 0.1 < hit.mean() < 0.99
+
+
+@pytest.mark.parametrize(
+    ("place", "expected"),
+    [
+        ([0.0, 0.0, 0.0], False),  # between the fingers
+        ([0.0, 0.05, 0.0], True),  # in the +y finger
+        ([0.0, -0.05, 0.0], True),
+        ([0.0, 0.068, 0.0], False),  # beside it
+        ([0.0, 0.05, 0.009], False),  # beyond the tips
+        ([0.0, 0.06, 0.005], False),  # where the finger is tapered
+        ([0.0, 0.06, -0.03], True),  # where it is not
+        ([0.025, 0.0, -0.05], False),  # where the palm is tapered
+        ([0.025, 0.0, -0.1], True),  # where it is not
+        ([0.011, 0.05, 0.0], False),  # in front of it
+        ([0.0, 0.0, -0.04], True),  # in the palm
+        ([0.0, 0.0, -0.036], False),  # just before the palm
+        ([0.0, 0.05, -0.07], True),  # where the finger passes
+        ([0.0, 0.0, -0.17], True),  # where the palm passes
+        ([0.0, 0.0, -0.18], False),  # behind the whole way
+    ],
+)
+def test_a_point_is_hit_where_the_hand_passes(place: list[float], expected: bool) -> None:
+    assert hits(np.array([place]), np.eye(4)[None], 0.08).tolist() == [expected]
+
+
+@given(seed=st.integers(0, 2**31))
+@settings(max_examples=10, deadline=None)
+def test_a_hand_turned_by_half_a_turn_collides_equally(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.1, 0.1, (8, 3))
+    Ts = np.array([random_motion(rng, reach=0.08).matrix for _ in range(40)])
+    turned = Ts @ Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)).matrix
+    np.testing.assert_array_equal(hits(points, Ts, 0.08), hits(points, turned, 0.08))
+
+
+def test_no_candidates_have_no_collisions() -> None:
+    assert hits(np.zeros((5, 3)), np.empty((0, 4, 4)), 0.08).shape == (0,)
+
+
+def test_points_are_expressed_in_every_grasps_frame() -> None:
+    rng = np.random.default_rng(0)
+    points = rng.uniform(-0.2, 0.2, (20, 3))
+    motions = [random_motion(rng) for _ in range(6)]
+    Ts = torch.from_numpy(np.array([motion.matrix for motion in motions]))
+    found = torch.stack(collision.points_in_grasp_frames(torch.from_numpy(points), Ts), dim=2)
+    expected = np.array([motion.inverse().apply(points) for motion in motions])
+    np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+# The shadow of a square of 20 x 20 cm at z = 0, spacing 4 mm, seen from straight above.
+
+_GRID = np.arange(-0.1, 0.1001, 0.004)
+SQUARE = np.stack([*np.meshgrid(_GRID, _GRID), np.zeros((len(_GRID), len(_GRID)))], axis=2).reshape(-1, 3)
+ABOVE = np.array([0.0, 0.0, 0.6])
+HAND_ALONG_X = np.array([[0.0, 0, 1, 0], [0, 1, 0, 0], [-1, 0, 0, 0], [0, 0, 0, 1]])
+"""Travels along +x, fingers along y: flat under or over the square."""
+
+
+def shadowed(*translations: list[float], viewpoints: Array = ABOVE[None], points: Array = SQUARE) -> list[bool]:
+    Ts = np.tile(HAND_ALONG_X, (len(translations), 1, 1))
+    Ts[:, :3, 3] = translations
+    found: list[bool] = collision.in_shadow(
+        bare_cloud(points, viewpoints), torch.from_numpy(Ts).float(), PANDA, 0.08
+    ).tolist()
+    return found
+
+
+def test_a_hand_behind_a_surface_is_hidden_and_one_before_or_beside_it_is_not() -> None:
+    behind, just_behind, before, beside, far_behind = (
+        [0.0, 0.0, -0.1], [0.0, 0.0, -0.02], [0.0, 0.0, 0.1], [0.5, 0.0, -0.1], [0.0, 0.0, -0.4],
+    )  # fmt: skip
+    assert shadowed(behind, just_behind, before, beside, far_behind) == [True, True, False, False, True]
+
+
+def test_a_hand_within_the_margin_of_a_surface_is_not_hidden() -> None:
+    assert shadowed([0.0, 0.0, -0.005]) == [False]
+
+
+def test_what_reaches_into_the_shadow_with_one_finger_is_hidden() -> None:
+    assert shadowed([0.0, 0.14, -0.1], [0.0, 0.3, -0.1]) == [True, False]
+
+
+def test_a_second_viewpoint_that_sees_the_place_lifts_the_shadow() -> None:
+    below = np.array([0.0, 0.0, -0.6])
+    assert shadowed([0.0, 0.0, -0.1], viewpoints=np.stack([ABOVE, below])) == [False]
+    assert shadowed([0.0, 0.0, -0.1], viewpoints=np.stack([ABOVE, ABOVE + 0.01])) == [True]
+
+
+@pytest.mark.parametrize("turn", range(3))
+def test_the_shadow_moves_with_the_scene(turn: int) -> None:
+    motion = random_motion(np.random.default_rng(turn))
+    Ts = np.tile(HAND_ALONG_X, (3, 1, 1))
+    Ts[:, :3, 3] = [[0.0, 0.0, -0.1], [0.0, 0.0, 0.1], [0.5, 0.0, -0.1]]
+    moved = torch.from_numpy(motion.matrix @ Ts).float()
+    cloud = bare_cloud(motion.apply(SQUARE), motion.apply(ABOVE[None]))
+    assert collision.in_shadow(cloud, moved, PANDA, 0.08).tolist() == [True, False, False]
+
+
+@pytest.mark.parametrize("viewpoint", [[0.0, 0.0, 0.0], [0.0, 0.0, 1e6]])
+def test_a_viewpoint_inside_the_cloud_or_far_away_is_no_trouble(viewpoint: list[float]) -> None:
+    assert len(shadowed([0.0, 0.0, -0.1], viewpoints=np.array([viewpoint]))) == 1

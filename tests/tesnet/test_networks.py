@@ -1,0 +1,127 @@
+from __future__ import annotations
+
+import functools
+
+import numpy as np
+import pytest
+import torch
+
+from tesnet import candidates, cloud, networks
+from tesnet.candidates import Candidates
+from tesnet.networks.tesnet import CloudFeatures, edge_inputs, point_inputs
+from tesnet.query import GraspQuery
+from tests.tesnet.scenes import CAMERA, fresh_network, prepared, tabletop, tabletop_query
+
+
+@functools.cache
+def example() -> tuple[cloud.PreparedCloud, Candidates]:
+    query = tabletop_query(max_candidates=150)
+    ready = prepared(query)
+    return ready, candidates.generate(ready, query, candidates.CandidateConfig())[0]
+
+
+@functools.cache
+def features() -> CloudFeatures:
+    with torch.inference_mode():
+        return fresh_network().encode(example()[0])
+
+
+@torch.inference_mode()
+def score(found: Candidates, mirror: torch.Tensor | None = None) -> torch.Tensor:
+    return fresh_network().score(features(), example()[0], found, mirror)
+
+
+def test_there_is_a_feature_for_every_point_and_a_logit_for_every_candidate() -> None:
+    ready, found = example()
+    assert features().points.shape == (len(ready), 64)
+    assert features().context.shape == (32,)
+    logits = score(found)
+    assert logits.shape == (len(found),)
+    assert torch.isfinite(logits).all()
+    assert len(logits.unique()) > len(found) // 2
+
+
+def test_a_batch_of_candidates_is_scored_as_one_by_one() -> None:
+    _, found = example()
+    few = found.select(torch.arange(0, len(found), 10))
+    alone = torch.cat([score(few.select(torch.tensor([i]))) for i in range(len(few))])
+    torch.testing.assert_close(score(few), alone, atol=1e-5, rtol=0)
+
+
+def test_no_candidates_have_no_scores() -> None:
+    assert score(example()[1].select(torch.zeros(0, dtype=torch.long))).shape == (0,)
+
+
+def test_scores_follow_their_candidates_in_another_order() -> None:
+    _, found = example()
+    order = torch.randperm(len(found), generator=torch.Generator().manual_seed(0))
+    torch.testing.assert_close(score(found.select(order)), score(found)[order], atol=1e-5, rtol=0)
+
+
+def test_the_regions_hold_the_points_that_a_loop_finds_there() -> None:
+    ready, found = example()
+    network = fresh_network()
+    index, inside, totals = network.regions(ready, found.Ts_canonical_grasp)
+    config = network.config
+    assert index.shape == inside.shape == (len(found), config.closing_points + config.around_points)
+    points = ready.points.double().numpy()
+    parts = (
+        (config.closing_region, 0, config.closing_points),
+        (config.around_region, config.closing_points, config.around_points),
+    )
+    for row in range(0, len(found), 12):
+        T = found.Ts_canonical_grasp[row].double().numpy()
+        local = (points - T[:3, 3]) @ T[:3, :3]
+        for number, ((breadth, length, behind, ahead), begin, size) in enumerate(parts):
+            slack = np.min(
+                [breadth - abs(local[:, 0]), length - abs(local[:, 1]), local[:, 2] + behind, ahead - local[:, 2]],
+                axis=0,
+            )
+            certain, possible = (set(np.flatnonzero(slack > limit).tolist()) for limit in (1e-6, -1e-6))
+            chosen = index[row, begin : begin + size][inside[row, begin : begin + size]].tolist()
+            assert len(certain) <= int(totals[row, number]) <= len(possible)
+            assert len(chosen) == len(set(chosen)) == min(size, int(totals[row, number]))
+            assert set(chosen) <= possible
+
+
+def test_a_mirrored_scene_scores_as_the_mirror_option_says() -> None:
+    """Reflecting everything in the hand's plane, which holds y and z, changes the sign of x in the grasp frame."""
+    _, found = example()
+    one = torch.ones(len(found))
+    torch.testing.assert_close(score(found, one), score(found))
+    assert (score(found, -one) - score(found)).abs().max() > 1e-4
+
+
+def test_point_pair_features_are_distances_and_cosines() -> None:
+    ready, _ = example()
+    edges = edge_inputs(ready)
+    assert edges.shape == (len(ready), 16, 4)
+    for point in range(0, len(ready), 300):
+        other = int(ready.neighbours[point, 5])
+        p, q, n, m = (x.double().numpy() for x in (*ready.points[[point, other]], *ready.normals[[point, other]]))
+        distance = np.linalg.norm(q - p)
+        expected = [distance / 0.02, n @ (q - p) / distance, m @ (q - p) / distance, n @ m]
+        np.testing.assert_allclose(edges[point, 5], expected, atol=1e-5)
+    assert (edges[:, :, 1:].abs() <= 1 + 1e-5).all()
+
+
+@pytest.mark.parametrize(("options", "known"), [({}, 0), ({"up": [0, 0, 1]}, 1)])
+def test_what_the_caller_does_not_know_is_zero(options: dict[str, list[float]], known: int) -> None:
+    inputs = point_inputs(prepared(GraspQuery(tabletop(0), viewpoints=CAMERA, up=options.get("up"))))
+    assert inputs.shape[1] == 7
+    assert (inputs[:, 4] == known).all()  # whether up is known
+    assert (inputs[:, 5:] == 0).all()  # height and whether it is known
+    assert bool((inputs[:, 3] == 0).all()) == (known == 0)
+
+
+def test_an_unknown_network_or_field_is_refused_with_the_valid_ones() -> None:
+    with pytest.raises(ValueError, match="unknown network 'vgn'; valid: tesnet"):
+        networks.build("vgn")
+    with pytest.raises(ValueError, match="unknown configuration depth of tesnet; valid: channels, stages"):
+        networks.build("tesnet", {"depth": 3})
+
+
+def test_a_configuration_from_json_builds_the_same_network() -> None:
+    network = networks.build("tesnet", {"channels": 16, "region_channels": [32, 48]})
+    assert network.config.region_channels == (32, 48)
+    assert network.state_dict()["lift.weight"].shape[0] == 16

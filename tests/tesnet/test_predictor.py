@@ -1,0 +1,282 @@
+from __future__ import annotations
+
+import functools
+import subprocess
+import sys
+from dataclasses import replace
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from tesnet import weights
+from tesnet.errors import DeviceError, WeightsError
+from tesnet.geometry import PANDA
+from tesnet.predictor import GraspPredictor, configuration_of
+from tesnet.query import ApproachCone, Box, GraspQuery
+from tesnet.result import REJECTIONS, GraspResult
+from tests.tesnet.scenes import (
+    CAMERA,
+    UP,
+    WORKSPACE,
+    Array,
+    fresh_network,
+    fresh_predictor,
+    tabletop,
+    tabletop_query,
+)
+
+RNG = np.random.default_rng(0)
+ALONG = np.linspace(-0.15, 0.15, 600)[:, None]
+SHEET = RNG.uniform(-0.1, 0.1, (3000, 2))
+
+STRANGE_CLOUDS: dict[str, Array] = {
+    "empty": np.empty((0, 3)),
+    "one point": np.zeros((1, 3)),
+    "all points equal": np.full((500, 3), 0.3),
+    "a line": ALONG * [1.0, 0, 0],
+    "an upright line": ALONG * [0, 0, 1.0],
+    "a slanted line": ALONG * [0.3, 0.5, 0.8],
+    "a horizontal plane": np.column_stack([SHEET, np.zeros(3000)]),
+    "an upright plane": np.column_stack([np.zeros(3000), SHEET]),
+    "a blob": RNG.normal(0, 0.02, (2000, 3)),
+    "dust": RNG.uniform(-0.5, 0.5, (3000, 3)),
+    "two tables": np.vstack([tabletop(0), tabletop(1) + [4.0, 0, 0]]),
+    "outliers": np.vstack([tabletop(0), RNG.normal(0, 1e6, (100, 3))]),
+    "extreme outliers": np.vstack([tabletop(0), [[3e38, -3e38, 3e38], [-3e38, 3e38, 0]]]),
+    "far away": tabletop(0) + [1e6, -1e6, 0],
+}
+
+
+@functools.cache
+def predictor() -> GraspPredictor:
+    return fresh_predictor(calibration=(8.0, 0.5))
+
+
+@functools.cache
+def answer(**options: Any) -> GraspResult:
+    return predictor().predict(tabletop_query(**options))
+
+
+def assert_sound(result: GraspResult, query: GraspQuery) -> None:
+    """What holds for every answer."""
+    counts = result.counts
+    assert counts.points == len(query.points)
+    assert set(counts.rejected) == set(REJECTIONS)
+    assert all(count >= 0 for count in counts.rejected.values())
+    assert counts.candidates - counts.rejected["collision"] == counts.collision_free
+    kept = counts.collision_free - counts.rejected["min_score"] - counts.rejected["duplicates"]
+    assert counts.returned <= kept
+    assert counts.returned == len(result.grasps) <= query.max_grasps
+    assert (counts.returned == min(kept, query.max_grasps)) or counts.returned == query.max_grasps
+    assert (result.reason is None) == (counts.returned > 0)
+    assert list(result.timings_ms) == ["prepare", "candidates", "network", "rank"]
+    assert all(value >= 0 for value in result.timings_ms.values())
+    scores = result.grasps.scores
+    assert ((scores >= query.min_score) & (scores <= 1)).all()
+    assert (np.diff(scores) <= 0).all()
+
+
+# Limits
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_no_grasp_breaks_a_limit_of_the_conventions(seed: int) -> None:
+    """Recomputed in float64 from what is returned; coordinates of the cloud are float32, hence a micrometre."""
+    cone = ApproachCone(np.array([0.0, 0.3, -1.0]), 70.0)
+    query = tabletop_query(seed, max_grasps=1000, separation_translation=0.0, approach=cone, workspace=WORKSPACE)
+    result = predictor().predict(query)
+    grasps = result.grasps
+    assert len(grasps) > 50
+    assert_sound(result, query)
+    p_a, p_c, Ts = grasps.approach_points, grasps.contact_points, grasps.Ts_cloud_grasp
+    x, y, z, tcp = (Ts[:, :3, column] for column in range(4))
+    d = p_c - p_a
+    offset = np.einsum("ij,ij->i", d, y)  # the closing direction is the contact point's normal
+    depth = np.einsum("ij,ij->i", d, z)
+    np.testing.assert_allclose(np.einsum("ij,ij->i", d, x), 0, atol=2e-6)  # the hand's plane holds both points
+    assert (np.linalg.norm(d, axis=1) <= 0.038 + 2e-6).all()
+    assert ((depth >= 0.003 - 2e-6) & (depth <= 0.040 + 2e-6)).all()
+    assert ((offset >= -0.003 - 2e-6) & (offset <= 0.038 + 2e-6)).all()
+    np.testing.assert_allclose(tcp, p_a + (depth - 0.0016)[:, None] * z, atol=2e-6)
+    assert (z @ UP < 0.1 + 1e-6).all()
+    angles = np.degrees(np.arccos(np.clip(z @ cone.direction, -1, 1)))
+    assert angles.max() <= 70.0 + 1e-3
+    corners = np.einsum("cij,kj->cki", Ts[:, :3, :3], PANDA.corners(0.08)) + tcp[:, None]
+    assert corners[:, :, 2].min() >= 0.004 - 2e-6
+    np.testing.assert_allclose(x, np.cross(y, z), atol=1e-6)
+    assert (grasps.widths == 0.08).all()
+    for points in (p_a, p_c):
+        assert cKDTree(query.points).query(points)[0].max() < 0.0045
+        assert ((points >= WORKSPACE.minimum) & (points <= WORKSPACE.maximum)).all()
+
+
+def test_grasps_keep_their_distance_from_each_other() -> None:
+    grasps = answer(max_grasps=100, separation_translation=0.02, separation_rotation_deg=180.0).grasps
+    tcp = grasps.Ts_cloud_grasp[:, :3, 3]
+    between = np.linalg.norm(tcp[:, None] - tcp[None], axis=2)[np.triu_indices(len(tcp), 1)]
+    assert len(tcp) > 5
+    assert between.min() >= 0.02 - 1e-6
+
+
+def test_a_grasp_in_the_shadow_counts_as_a_collision_when_the_unseen_is_occupied() -> None:
+    free, occupied = answer(), answer(unseen="occupied")
+    assert occupied.counts.collision_free < free.counts.collision_free
+    assert occupied.counts.candidates == free.counts.candidates
+    assert_sound(occupied, tabletop_query(unseen="occupied"))
+
+
+# Reasons
+
+
+@pytest.mark.parametrize(
+    ("query", "reason"),
+    [
+        (GraspQuery(np.empty((0, 3))), "too_few_points"),
+        (tabletop_query(workspace=Box(np.full(3, 3.0), np.full(3, 4.0))), "no_points_in_workspace"),
+        (GraspQuery(tabletop(0), up=UP, support_height=1.0), "no_points_in_workspace"),
+        (GraspQuery(np.zeros((1, 3))), "too_few_points"),
+        (GraspQuery(np.full((500, 3), 0.2)), "too_few_points"),
+        (GraspQuery(RNG.uniform(-1, 1, (60, 3))), "no_candidates"),
+        (tabletop_query(approach=ApproachCone(UP, 30.0)), "no_candidates"),  # from below only
+        (GraspQuery(np.column_stack([SHEET, np.zeros(3000)]), viewpoints=UP), "all_in_collision"),
+        (tabletop_query(min_score=1.0), "below_min_score"),
+    ],
+)
+def test_an_empty_answer_says_why(query: GraspQuery, reason: str) -> None:
+    result = predictor().predict(query)
+    assert result.reason == reason
+    assert_sound(result, query)
+
+
+@pytest.mark.parametrize("name", STRANGE_CLOUDS)
+@pytest.mark.parametrize("options", [{}, {"up": UP, "support_height": -0.2}], ids=["bare", "with_up"])
+def test_strange_clouds_have_a_sound_answer(name: str, options: dict[str, Any]) -> None:
+    query = GraspQuery(STRANGE_CLOUDS[name], **options)
+    assert_sound(predictor().predict(query), query)
+
+
+@pytest.mark.slow
+def test_a_million_points_all_over_a_room_are_answered_with_a_warning() -> None:
+    points = np.random.default_rng(0).uniform(0, 1, (1_000_000, 3)) * [8.0, 6.0, 3.0]
+    query = GraspQuery(points, viewpoints=np.array([4.0, 3, 2.9]), up=UP)
+    result = predictor().predict(query)
+    assert_sound(result, query)
+    assert result.counts.prepared_points <= 12_000
+    assert any("the cloud is large" in note and "set workspace" in note for note in result.warnings)
+
+
+# Warnings
+
+
+def test_a_careful_query_has_no_warnings() -> None:
+    assert answer().warnings == ()
+
+
+@pytest.mark.parametrize(
+    ("query", "says"),
+    [
+        (GraspQuery(tabletop(0), up=UP), "viewpoint not given"),
+        (GraspQuery(tabletop(0), viewpoints=CAMERA), "up not given"),
+        (replace(tabletop_query(), points=STRANGE_CLOUDS["outliers"]), "points farther than 10 m"),
+        (replace(tabletop_query(), points=tabletop(0) + [1e5, 0, 0]), "kept to 7.8 mm only: use a frame near"),
+    ],
+)
+def test_what_the_caller_should_know_is_a_warning(query: GraspQuery, says: str) -> None:
+    assert [says in note for note in predictor().predict(query).warnings] == [True]
+
+
+# Repetition
+
+
+def test_equal_queries_have_equal_answers() -> None:
+    first, second = (predictor().predict(tabletop_query()) for _ in range(2))
+    np.testing.assert_array_equal(first.grasps.Ts_cloud_grasp, second.grasps.Ts_cloud_grasp)
+    np.testing.assert_array_equal(first.grasps.scores, second.grasps.scores)
+    assert first.counts == second.counts
+
+
+def test_another_seed_tries_other_candidates() -> None:
+    other = predictor().predict(replace(tabletop_query(), seed=1))
+    assert not np.array_equal(other.grasps.approach_points, answer().grasps.approach_points)
+
+
+def test_an_answer_leaves_no_trace_in_the_predictor() -> None:
+    fresh = fresh_predictor(calibration=(8.0, 0.5))
+    fresh.warm_up()
+    fresh.predict(tabletop_query(2))
+    np.testing.assert_array_equal(fresh.predict(tabletop_query()).grasps.scores, answer().grasps.scores)
+
+
+def test_the_global_random_state_is_neither_read_nor_changed() -> None:
+    torch.manual_seed(1)
+    before = torch.get_rng_state()
+    result = predictor().predict(tabletop_query())
+    assert torch.equal(torch.get_rng_state(), before)
+    np.testing.assert_array_equal(result.grasps.scores, answer().grasps.scores)
+
+
+def test_scores_are_calibrated_logits() -> None:
+    plain = fresh_predictor(calibration=(1.0, 0.0)).predict(tabletop_query()).grasps.scores
+    logits = np.log(plain / (1 - plain))
+    np.testing.assert_allclose(answer().grasps.scores, 1 / (1 + np.exp(-(8.0 * logits + 0.5))), atol=1e-5)
+
+
+# Loading
+
+
+def test_a_saved_network_answers_like_the_one_in_memory(tmp_path: Path) -> None:
+    network = fresh_network()
+    header = weights.Header("tesnet", "3", configuration_of(network.config), (8.0, 0.5), {"seed": 7})
+    weights.save(tmp_path / "a.safetensors", network.state_dict(), header)
+    loaded = GraspPredictor.load(tmp_path / "a.safetensors")
+    np.testing.assert_array_equal(loaded.predict(tabletop_query()).grasps.scores, answer().grasps.scores)
+    assert (loaded.model.name, loaded.model.version, loaded.model.card) == ("tesnet", "3", {"seed": 7})
+    assert loaded.model.weights_sha256 == weights.sha256(tmp_path / "a.safetensors")
+    assert set(loaded.model.configuration) == {"network", "preparation", "candidates"}
+
+
+@pytest.mark.parametrize(
+    ("name", "change"),
+    [
+        ("vgn", {}),
+        ("tesnet", {"network": {"depth": 3}}),
+        ("tesnet", {"network": {"channels": 16}}),
+        ("tesnet", {"network": {"channels": "wide"}}),
+        ("tesnet", {"preparation": {"voxel": 1}}),
+        ("tesnet", {"candidates": None}),
+    ],
+)
+def test_weights_of_another_network_are_refused(tmp_path: Path, name: str, change: dict[str, Any]) -> None:
+    network = fresh_network()
+    configuration = configuration_of(network.config) | change
+    weights.save(tmp_path / "a.safetensors", network.state_dict(), weights.Header(name, "0", configuration))
+    with pytest.raises(WeightsError, match=r"a\.safetensors"):
+        GraspPredictor.load(tmp_path / "a.safetensors")
+
+
+@pytest.mark.parametrize("device", ["abacus", "meta", "cuda:99"])
+def test_a_device_that_does_not_exist_is_refused(tmp_path: Path, device: str) -> None:
+    with pytest.raises(DeviceError, match="choose"):
+        GraspPredictor.load(tmp_path / "none.safetensors", device=device)
+
+
+def test_the_number_of_threads_is_set_on_request(tmp_path: Path) -> None:
+    """In a process of its own, since it is the whole process's number."""
+    network = fresh_network()
+    weights.save(
+        tmp_path / "a.safetensors",
+        network.state_dict(),
+        weights.Header("tesnet", "0", configuration_of(network.config)),
+    )
+    program = (
+        "import sys, torch; from pathlib import Path; from tesnet.predictor import GraspPredictor;"
+        "GraspPredictor.load(Path(sys.argv[1]), num_threads=3); print(torch.get_num_threads())"
+    )
+    done = subprocess.run(
+        [sys.executable, "-c", program, str(tmp_path / "a.safetensors")], capture_output=True, text=True, check=True
+    )
+    assert done.stdout.strip() == "3"

@@ -1,0 +1,164 @@
+from __future__ import annotations
+
+import re
+from typing import Any
+
+import numpy as np
+import pytest
+from hypothesis import given, settings
+from hypothesis import strategies as st
+
+from tesnet.errors import InvalidQuery, TesnetError
+from tesnet.query import ApproachCone, Box, GraspQuery
+from tests.tesnet.scenes import UP
+
+POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
+
+BAD_POINTS: list[tuple[Any, str]] = [
+    (np.zeros(3), r"shape \(3,\); give an array of N x 3"),
+    (np.zeros((4, 2)), r"shape \(4, 2\); give"),
+    (np.zeros((2, 2, 3)), "give an array of N x 3"),
+    ([], "give an array of N x 3"),
+    ([[1, 2, 3], [1, 2]], "no array of real numbers; give"),
+    ([["a", "b", "c"]], "no array of real numbers; give"),
+    (np.zeros((5, 3), dtype=complex), "no array of real numbers; give"),
+    (None, "no array of real numbers; give"),
+    (np.array([[0, 0, 0], [0, np.nan, 0], [np.inf, 0, 0]]), "2 of 3 are NaN or infinite; remove them"),
+    (np.full((5, 3), 1e39), "5 of 5 are NaN or infinite; remove them"),
+    (POINTS * 1000, r"span 310 m \(.*limit 20 m\); .*divide millimetres by 1000"),
+    (np.array([[3e38] * 3, [-3e38] * 3] * 20), r"limit 20 m"),
+]
+
+BAD_OPTIONS: list[tuple[str, dict[str, Any], str]] = [
+    ("viewpoint", {"viewpoints": [1.0, 2.0]}, r"shape \(1, 2\); give an array of N x 3"),
+    ("viewpoint", {"viewpoints": "here"}, "no array of real numbers; give"),
+    ("viewpoint", {"viewpoints": [[1, 2, 3], [1]]}, "no array of real numbers; give"),
+    ("viewpoint", {"viewpoints": np.zeros((0, 3))}, "has 0 positions; give 1 to 64"),
+    ("viewpoint", {"viewpoints": np.zeros((65, 3))}, "has 65 positions; give 1 to 64"),
+    ("viewpoint", {"viewpoints": [0, np.nan, 0]}, "NaN or an infinity; .*remove"),
+    ("viewpoint", {"viewpoints": [0, 0, -1e300]}, r"is 1e\+300; it must lie between 0 and 1e\+09 m"),
+    ("up", {"up": [0, 0, 0]}, "length 0; give a direction whose length is between"),
+    ("up", {"up": [0, 0, 1e39]}, r"length 1e\+39; give a direction"),
+    ("up", {"up": [0, 1]}, r"shape \(2,\); give"),
+    ("up", {"up": [0, np.inf, 0]}, "must be finite, remove"),
+    ("support_height", {"support_height": 0.1}, "needs `up`.*give `up` as well"),
+    ("support_height", {"up": UP, "support_height": np.nan}, "is nan; it must lie between"),
+    ("support_height", {"up": UP, "support_height": -1e300}, r"is -1e\+300; it must lie between"),
+    ("support_height", {"up": UP, "support_height": "low"}, "is of type str; give a number between"),
+    ("workspace", {"workspace": [[0, 0, 0], [1, 1, 1]]}, "is of type list; give a Box"),
+    ("approach", {"approach": UP}, "is of type ndarray; give an? ApproachCone"),
+    ("max_grasps", {"max_grasps": 0}, "is 0; it must be a whole number between 1 and 1000"),
+    ("max_grasps", {"max_grasps": 1001}, "is 1001; .* between 1 and 1000"),
+    ("max_grasps", {"max_grasps": 2.5}, "is 2.5; it must be a whole number"),
+    ("max_grasps", {"max_grasps": None}, "is of type NoneType; it must be a whole number"),
+    ("min_score", {"min_score": -0.1}, "is -0.1; it must lie between 0 and 1"),
+    ("min_score", {"min_score": 1.1}, "is 1.1; it must lie between 0 and 1"),
+    ("min_score", {"min_score": np.nan}, "is nan; it must lie between 0 and 1"),
+    ("min_score", {"min_score": "high"}, "is of type str; give a number between 0 and 1"),
+    ("min_separation", {"separation_translation": -0.01}, "is -0.01; it must lie between 0 and 1 m"),
+    ("min_separation", {"separation_translation": 1.5}, "is 1.5; it must lie between 0 and 1 m"),
+    ("min_separation", {"separation_rotation_deg": -1}, "is -1; it must lie between 0 and 180 degrees"),
+    ("min_separation", {"separation_rotation_deg": 181}, "is 181; it must lie between 0 and 180 degrees"),
+    ("num_approach_points", {"num_approach_points": 0}, "is 0; .* between 1 and 1024"),
+    ("num_approach_points", {"num_approach_points": 1025}, "is 1025; .* between 1 and 1024"),
+    ("max_candidates", {"max_candidates": 0}, "is 0; .* between 1 and 20000"),
+    ("max_candidates", {"max_candidates": 20_001}, "is 20001; .* between 1 and 20000"),
+    ("unseen", {"unseen": "maybe"}, "is 'maybe'; valid: free, occupied"),
+    ("seed", {"seed": -1}, "is -1; .* between 0 and 9223372036854775807"),
+    ("seed", {"seed": 2**63}, "is 9223372036854775808; .* between 0 and"),
+    ("seed", {"seed": 0.5}, "is 0.5; it must be a whole number"),
+]
+
+
+@pytest.mark.parametrize(("points", "says"), BAD_POINTS)
+def test_bad_points_are_refused_with_value_limit_and_remedy(points: Any, says: str) -> None:
+    with pytest.raises(InvalidQuery, match=says) as caught:
+        GraspQuery(points)
+    assert caught.value.field == "points"
+
+
+@pytest.mark.parametrize(("field", "options", "says"), BAD_OPTIONS)
+def test_bad_options_are_refused_with_value_limit_and_remedy(field: str, options: dict[str, Any], says: str) -> None:
+    with pytest.raises(InvalidQuery, match=says) as caught:
+        GraspQuery(POINTS, **options)
+    assert caught.value.field == field
+    assert str(caught.value).startswith(f"{field}: ")
+    assert isinstance(caught.value, TesnetError)
+
+
+def test_a_box_must_have_a_volume() -> None:
+    with pytest.raises(InvalidQuery, match=re.escape("min [0.0, 0.0, 0.0] is not below max [1.0, 0.0, 1.0]")):
+        Box(np.zeros(3), np.array([1.0, 0.0, 1.0]))
+    with pytest.raises(InvalidQuery, match="finite") as caught:
+        Box(np.zeros(3), np.array([1.0, np.nan, 1.0]))
+    assert caught.value.field == "workspace"
+
+
+@pytest.mark.parametrize("angle", [-1.0, 181.0, float("nan"), float("inf")])
+def test_a_cone_has_an_angle_between_0_and_180_degrees(angle: float) -> None:
+    with pytest.raises(InvalidQuery, match="between 0 and 180 degrees") as caught:
+        ApproachCone(UP, angle)
+    assert caught.value.field == "approach"
+    with pytest.raises(InvalidQuery, match="length 0"):
+        ApproachCone(np.zeros(3), 30.0)
+
+
+@given(
+    seed=st.integers(0, 2**31),
+    size=st.sampled_from([1, 2, 50]),
+    scale=st.sampled_from([1e-30, 1e-3, 1, 1e30, 1e38, np.nan]),
+)
+@settings(max_examples=40, deadline=None)
+def test_any_cloud_is_either_taken_or_refused(seed: int, size: int, scale: float) -> None:
+    points = np.random.default_rng(seed).normal(size=(size, 3)) * scale
+    try:
+        query = GraspQuery(points)
+    except InvalidQuery as error:
+        assert error.field == "points"  # noqa: PT017  either outcome is right
+    else:
+        assert query.points.shape == (size, 3)
+        assert np.isfinite(query.points).all()
+
+
+def test_far_outliers_do_not_make_a_cloud_look_like_millimetres() -> None:
+    points = np.vstack([POINTS, [[1e5, 0, 0]], [[0, -1e7, 0]]])
+    assert len(GraspQuery(points).points) == 52
+
+
+def test_a_query_copies_its_arrays_and_keeps_them_read_only() -> None:
+    points, viewpoint = POINTS.copy(), np.array([0.0, 0.0, 1.0])
+    query = GraspQuery(points, viewpoints=viewpoint, up=viewpoint)
+    points[:], viewpoint[:] = 9, 9
+    assert query.points.dtype == np.float32
+    np.testing.assert_allclose(query.points, POINTS, atol=1e-7)
+    assert query.viewpoints is not None
+    assert query.up is not None
+    np.testing.assert_array_equal(query.viewpoints, [[0, 0, 1]])
+    for array in (query.points, query.viewpoints, query.up):
+        with pytest.raises(ValueError, match="read-only"):
+            array[:] = 0
+
+
+def test_directions_become_unit_vectors_and_limits_are_inclusive() -> None:
+    query = GraspQuery(
+        POINTS,
+        viewpoints=np.zeros((64, 3)),
+        up=np.array([0, 0, 7.0]),
+        approach=ApproachCone(np.array([0, -3.0, 0]), 180.0),
+        max_grasps=1000,
+        min_score=1.0,
+        separation_translation=1.0,
+        separation_rotation_deg=180,
+        num_approach_points=1024,
+        max_candidates=20_000,
+        seed=2**63 - 1,
+    )
+    assert query.up is not None
+    assert query.approach is not None
+    np.testing.assert_array_equal(query.up, [0, 0, 1])
+    np.testing.assert_array_equal(query.approach.direction, [0, -1, 0])
+
+
+def test_whole_numbers_of_numpy_are_whole_numbers() -> None:
+    query = GraspQuery(POINTS, max_grasps=np.int64(3), seed=np.uint32(7), min_score=np.float32(0.5))
+    assert query.max_grasps == 3
