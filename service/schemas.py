@@ -90,7 +90,8 @@ class GraspOptions(RequestPart):
         default=32,
         ge=1,
         le=MAX_APPROACH_POINTS,
-        description=f"Search effort: approach points sampled, 1 to {MAX_APPROACH_POINTS}.",
+        description=f"Search effort: approach points to begin with, 1 to {MAX_APPROACH_POINTS}. While they "
+        "yield fewer than half of `max_candidates` candidates, as beside flat objects, four times as many are tried.",
     )
     max_candidates: int = Field(
         default=2000, ge=1, le=MAX_CANDIDATES, description=f"Search effort: candidates scored, 1 to {MAX_CANDIDATES}."

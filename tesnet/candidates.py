@@ -14,7 +14,7 @@ from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
-from tesnet.query import GraspQuery
+from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
 
 TIP_BEYOND_CONTACT = 0.007
 """How far the fingertips reach past the depth of the contact point."""
@@ -77,9 +77,9 @@ def generate(
         candidates, alive, rejected = _search(
             cloud, query, config, gripper, farthest_points(cloud.points, count, start)
         )
-        if 2 * int(alive.sum()) >= query.max_candidates or count >= len(cloud):
+        if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(cloud), MAX_APPROACH_POINTS):
             break
-        count *= 4
+        count = min(4 * count, MAX_APPROACH_POINTS)  # time and memory grow with it
     survivors = alive.nonzero()[:, 0]
     if len(survivors) > query.max_candidates:
         chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values

@@ -11,7 +11,7 @@ from tesnet.geometry import GraspSet
 Reason = Literal["no_points_in_workspace", "too_few_points", "no_candidates", "all_in_collision", "below_min_score"]
 
 REJECTIONS = ("support", "from_below", "approach", "target", "collision", "min_score", "duplicates")
-"""The steps that drop candidates, in the order they are applied."""
+"""The steps that drop candidates; one that several would drop counts for the first that looks at it."""
 
 
 @dataclass(frozen=True, slots=True)

@@ -71,7 +71,8 @@ def generate(config: GenerateConfig, labels: int, workers: int, out: Path, resum
     done = {int(path.stem.split("_")[1]) for path in out.glob("scene_*.npz")}
     counts = np.zeros(len(OUTCOMES), dtype=np.int64)
     for path in scene_files([out]) if done else []:
-        counts += np.load(path)["counts"]
+        with np.load(path, allow_pickle=False) as stored:
+            counts += stored["counts"]
     started, fresh, busy_s = time.monotonic(), 0, 0.0
     pending = (number for number in range(10**9) if number not in done)
     context = multiprocessing.get_context("spawn")

@@ -90,7 +90,8 @@ def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
         LabelsError: not such a file.
     """
     try:
-        with np.load(path, allow_pickle=False) as stored:
+        # Opened here because numpy leaves a damaged file open.
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = dict(stored)
         description = json.loads(arrays["description"].tobytes())
         count = sum(name.endswith("/frame") for name in arrays)

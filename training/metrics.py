@@ -77,7 +77,7 @@ def calibration_error(probabilities: Logits, success: Success) -> float:
 
 
 def fit_calibration(logits: Logits, success: Success) -> tuple[float, float]:
-    """(a, b) that minimise the cross-entropy of sigmoid(a * logit + b) (Platt scaling), by Newton's method."""
+    """(a, b) that minimise the cross-entropy of sigmoid(a * logit + b) (Platt scaling), by damped Newton steps."""
     design = np.stack([logits, np.ones_like(logits)], axis=1)
     weights = np.array([1.0, 0.0])
     for _ in range(50):
@@ -85,6 +85,9 @@ def fit_calibration(logits: Logits, success: Success) -> tuple[float, float]:
         gradient = design.T @ (probability - success)
         curvature = (design * (probability * (1 - probability))[:, None]).T @ design + 1e-6 * np.eye(2)
         step = np.linalg.solve(curvature, gradient)
+        loss = cross_entropy(design @ weights, success)
+        while cross_entropy(design @ (weights - step), success) > loss and float(np.abs(step).max()) >= 1e-10:
+            step /= 2
         weights -= step
         if float(np.abs(step).max()) < 1e-10:
             break

@@ -136,7 +136,8 @@ class TesNet(nn.Module):
         index, inside, totals = self.regions(cloud, poses)
         geometry = _region_inputs(cloud, poses, index, sign)
         per_point = self.region_point(features.points)
-        hidden = self.region_geometry(geometry) + per_point.index_select(0, index.flatten()).view(*index.shape, -1)
+        gathered = per_point.index_select(0, index.flatten()).view(*index.shape, per_point.shape[1])
+        hidden = self.region_geometry(geometry) + gathered
         hidden = self.region_mlp(hidden).masked_fill(~inside[..., None], 0)
         closing, around = hidden.split([self.config.closing_points, self.config.around_points], dim=1)
         joined = (

@@ -16,11 +16,19 @@ from simharness.errors import UsageError
 from simharness.folder import RunFolder
 from simharness.page import page
 from simharness.photographer import FAILURES, FIRST_ROUNDS, VIEWS, Photographer, attempts_to_show, picture_name
-from simharness.pictures import close_up, cloud_picture, hand_lines, png, segmentation_colours
+from simharness.pictures import (
+    PICTURE_SIZE,
+    close_up,
+    cloud_picture,
+    hand_lines,
+    png,
+    segmentation_colours,
+    widen,
+)
 from simharness.records import ModelRecord, RoundRecord, Serving
 from simharness.report import package_versions, report, table
 from simharness.run import Run
-from tesnet.geometry import PANDA, CameraIntrinsics, Pose
+from tesnet.geometry import PANDA, Pose
 
 MODEL = ModelRecord("tesnet", "1.2", "ab" * 32)
 SERVING = Serving(None, 1, "cpu")
@@ -249,6 +257,8 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
     (tmp_path / "run.json").write_text("{")
     with pytest.raises(UsageError, match="cannot be read"):
         RunFolder(tmp_path).read_run()
+    with pytest.raises(UsageError, match="holds no run"):
+        RunFolder(tmp_path / "run.json").read_run()
 
 
 # Pictures
@@ -283,14 +293,46 @@ def test_an_empty_cloud_gives_a_picture_too() -> None:
     picture = cloud_picture(
         nothing.astype(np.float32), nothing.astype(np.uint8), np.eye(4), 0.08, (1, 2, 3), np.array([0.5, 0.5, 0.6])
     )
-    assert Image.open(io.BytesIO(png(picture))).size == (320, 240)
+    assert Image.open(io.BytesIO(png(picture))).size == PICTURE_SIZE
 
 
-def test_a_close_up_holds_the_middle_of_the_table() -> None:
-    intrinsics = CameraIntrinsics(640, 480, 540, 540, 320, 240)
-    camera = Pose.look_at([0.15, -0.5, 0.5], [0.15, 0.15, 0.1], [0.0, 0.0, 1.0])
-    image = np.zeros((480, 640, 3), np.uint8)
-    image[240, 320] = 255
-    part = close_up(image, camera, intrinsics)
-    assert part.shape == (240, 320, 3)
-    assert part[120, 160].tolist() == [255] * 3
+@pytest.mark.parametrize("corner", [(0, 0), (200, 300), (470, 630)])
+def test_a_close_up_holds_the_objects(corner: tuple[int, int]) -> None:
+    bodies = np.full((480, 640), -1, dtype=np.int32)
+    bodies[corner[0] : corner[0] + 10, corner[1] : corner[1] + 10] = 4
+    part = bodies[close_up(bodies, [4, 5])]
+    assert part.shape == (120, 160)
+    assert (part == 4).sum() == (bodies == 4).sum()
+
+
+def test_a_close_up_grows_with_the_objects_up_to_the_image() -> None:
+    bodies = np.zeros((480, 640), dtype=np.int32)
+    bodies[100:300, 200:300] = 4
+    rows, columns = close_up(bodies, [4])
+    assert rows.start < 100
+    assert rows.stop > 300
+    assert (columns.stop - columns.start) * 3 == pytest.approx((rows.stop - rows.start) * 4, abs=4)
+    bodies[:] = 4
+    assert bodies[close_up(bodies, [4])].shape == bodies.shape
+    assert bodies[close_up(bodies, [])].shape == bodies.shape
+
+
+def test_points_beside_an_object_get_its_colour() -> None:
+    image = np.zeros((3, 4, 3), np.uint8)
+    image[1, 1] = 200
+    known = np.zeros((3, 4), dtype=bool)
+    assert (widen(image, known) == image).all()
+    known[1, 1] = True
+    assert (widen(image, known) == 200).all()
+
+
+def test_what_points_hide_of_the_hand_is_pale() -> None:
+    # A wall before the hand, seen from the side of negative y.
+    x, z = np.meshgrid(np.linspace(0.05, 0.25, 300), np.linspace(0.05, 0.3, 300))
+    wall = np.stack([x.ravel(), np.full(x.size, 0.05), z.ravel()], axis=1).astype(np.float32)
+    grey = np.full((len(wall), 3), 100, dtype=np.uint8)
+    pose = Pose.from_quaternion([1.0, 0.0, 0.0, 0.0], [0.15, 0.2, 0.08]).matrix
+    picture = np.asarray(cloud_picture(wall, grey, pose, 0.08, (220, 38, 38), np.array([0.15, -0.4, 0.3])))
+    assert not (picture == (220, 38, 38)).all(axis=2).any()
+    red, green, blue = np.moveaxis(picture.astype(int), 2, 0)
+    assert ((red > green + 20) & (green == blue)).any()

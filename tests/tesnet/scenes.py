@@ -80,10 +80,15 @@ def tabletop(seed: int = 0, count: int = 40_000, noise: float = 0.0005) -> Array
     return seen + rng.normal(0, noise, seen.shape)
 
 
+def ask(points: Any, **options: Any) -> GraspQuery:
+    """A query about points of any number type."""
+    return GraspQuery(points, **options)
+
+
 def tabletop_query(seed: int = 0, **options: Any) -> GraspQuery:
     """A query about `tabletop(seed)` with everything a careful caller gives."""
-    given = {"viewpoints": CAMERA, "up": UP, "support_height": SUPPORT_HEIGHT}
-    return GraspQuery(tabletop(seed), **{**given, **options})
+    given = {"points": tabletop(seed), "viewpoints": CAMERA, "up": UP, "support_height": SUPPORT_HEIGHT}
+    return ask(**{**given, **options})
 
 
 def moved_query(query: GraspQuery, motion: Pose) -> GraspQuery:
@@ -99,7 +104,7 @@ def moved_query(query: GraspQuery, motion: Pose) -> GraspQuery:
             options["support_height"] = query.support_height + float(motion.translation @ options["up"])
     names = ("max_grasps", "min_score", "separation_translation", "separation_rotation_deg", "num_approach_points")
     options |= {name: getattr(query, name) for name in (*names, "max_candidates", "unseen", "seed")}
-    return GraspQuery(motion.apply(query.points), **options)
+    return ask(motion.apply(query.points), **options)
 
 
 def random_motion(rng: np.random.Generator, reach: float = 0.5) -> Pose:

@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import math
-from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -15,13 +14,14 @@ from torch import Tensor
 
 from tesnet import cloud
 from tesnet.geometry import Pose
-from tesnet.query import Box, GraspQuery
+from tesnet.query import Box
 from tests.tesnet.scenes import (
     CAMERA,
     CPU,
     SUPPORT_HEIGHT,
     UP,
     Array,
+    ask,
     box_surface,
     moved_query,
     prepared,
@@ -130,7 +130,8 @@ def test_neighbours_after_dropping_points_are_those_of_a_fresh_search(seed: int,
     assert neighbours.shape == fresh.shape
 
     def distances(index: Tensor) -> Tensor:
-        return (kept[index] - kept[:, None]).norm(dim=2)
+        found: Tensor = (kept[index] - kept[:, None]).norm(dim=2)
+        return found
 
     torch.testing.assert_close(distances(neighbours), distances(fresh), atol=1e-7, rtol=0)
     assert torch.equal(neighbours[:, 0], fresh[:, 0])
@@ -228,7 +229,7 @@ def test_with_one_viewpoint_every_normal_faces_it() -> None:
 @settings(max_examples=5, deadline=None)
 def test_the_canonical_frame_moves_with_the_cloud(seed: int, with_up: bool) -> None:
     rng = np.random.default_rng(seed)
-    query = tabletop_query(seed % 3) if with_up else GraspQuery(tabletop(seed % 3), viewpoints=CAMERA)
+    query = tabletop_query(seed % 3) if with_up else ask(tabletop(seed % 3), viewpoints=CAMERA)
     moved = moved_query(query, random_motion(rng))
     first, second = prepared(query), prepared(moved)
     # float32 coordinates of the moved query are exact to 6e-8 m or so; a point in a few thousand changes its cell.
@@ -284,12 +285,10 @@ def test_cropping_keeps_the_workspace_above_the_support() -> None:
     points = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
     tilted = np.array([0.0, 0.6, 0.8])
     box = Box(np.array([-0.5, -0.2, -0.9]), np.array([0.1, 0.7, 0.9]))
-    kept = cloud.crop(
-        torch.from_numpy(points), GraspQuery(points, workspace=box, up=tilted, support_height=0.1)
-    ).numpy()
+    kept = cloud.crop(torch.from_numpy(points), ask(points, workspace=box, up=tilted, support_height=0.1)).numpy()
     wanted = points[((points >= box.minimum) & (points <= box.maximum)).all(axis=1) & (points @ tilted >= 0.1 + 0.005)]
     np.testing.assert_array_equal(kept, wanted)
-    assert len(cloud.crop(torch.from_numpy(points), GraspQuery(points))) == len(points)
+    assert len(cloud.crop(torch.from_numpy(points), ask(points))) == len(points)
 
 
 def test_a_prepared_cloud_is_complete_and_consistent() -> None:
@@ -312,13 +311,13 @@ def test_a_prepared_cloud_is_complete_and_consistent() -> None:
 
 def test_outliers_in_the_air_are_dropped() -> None:
     points = np.vstack([tabletop(0), [[0.0, 0.0, 0.25], [0.1, -0.1, 0.3]]])
-    ready = prepared(GraspQuery(points, viewpoints=CAMERA, up=UP))
+    ready = prepared(ask(points, viewpoints=CAMERA, up=UP))
     assert ready.T_cloud_canonical.apply(ready.points.numpy())[:, 2].max() < 0.15
 
 
 def test_a_room_is_cut_down_to_the_points_around_its_median() -> None:
     rng = np.random.default_rng(0)
-    query = GraspQuery(rng.uniform(-1, 1, (6000, 3)), viewpoints=CAMERA)
+    query = ask(rng.uniform(-1, 1, (6000, 3)), viewpoints=CAMERA)
     ready = prepared(query, max_points=1000)
     everything = prepared(query, max_points=10_000)
     assert ready.dropped_surplus == len(query.points) - 1000
@@ -330,8 +329,8 @@ def test_a_room_is_cut_down_to_the_points_around_its_median() -> None:
 
 def test_far_points_are_ignored_and_counted() -> None:
     points = np.vstack([tabletop(0), np.random.default_rng(0).normal(0, 1e6, (30, 3)), [[3e38, 0, -3e38]]])
-    query = GraspQuery(points, viewpoints=CAMERA, up=UP)
-    ready, alone = prepared(query), prepared(replace(query, points=tabletop(0)))
+    query = ask(points, viewpoints=CAMERA, up=UP)
+    ready, alone = prepared(query), prepared(ask(tabletop(0), viewpoints=CAMERA, up=UP))
     assert ready.dropped_far == 31
     assert alone.dropped_far == 0
     torch.testing.assert_close(ready.points, alone.points)
@@ -341,5 +340,5 @@ def test_far_points_are_ignored_and_counted() -> None:
     "options", [{"workspace": Box(np.full(3, 5.0), np.full(3, 6.0))}, {"up": UP, "support_height": 3.0}]
 )
 def test_nothing_left_is_none(options: dict[str, Any]) -> None:
-    assert cloud.prepare(GraspQuery(tabletop(0), **options), cloud.PreparationConfig(), CPU) is None
-    assert cloud.prepare(GraspQuery(np.empty((0, 3))), cloud.PreparationConfig(), CPU) is None
+    assert cloud.prepare(ask(tabletop(0), **options), cloud.PreparationConfig(), CPU) is None
+    assert cloud.prepare(ask(np.empty((0, 3))), cloud.PreparationConfig(), CPU) is None

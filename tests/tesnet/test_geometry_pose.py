@@ -16,7 +16,14 @@ FEW = settings(max_examples=30, deadline=None)
 def poses(draw: st.DrawFn) -> Pose:
     """Any rotation, half turns and no turn among them, and a translation of up to 10 m."""
     rng = np.random.default_rng(draw(st.integers(0, 2**31)))
-    special = [[0, 0, 0, 1], [1, 0, 0, 0], [0, 1, 0, 0], [0, 0, 1, 0], [1, 1, 0, 1e-9], [0, 1, -1, 0]]
+    special: list[list[float]] = [
+        [0, 0, 0, 1],
+        [1, 0, 0, 0],
+        [0, 1, 0, 0],
+        [0, 0, 1, 0],
+        [1, 1, 0, 1e-9],
+        [0, 1, -1, 0],
+    ]
     quaternion = draw(st.sampled_from([*special, None]))
     return Pose.from_quaternion(rng.normal(size=4) if quaternion is None else quaternion, rng.uniform(-10, 10, 3))
 
@@ -90,7 +97,7 @@ def test_look_at_puts_the_target_in_the_centre_with_up_upwards(seed: int) -> Non
     T_world_camera = Pose.look_at(eye, target, [0, 0, 1])
     np.testing.assert_allclose(T_world_camera.translation, eye)
     seen = T_world_camera.inverse().apply(target)
-    np.testing.assert_allclose(seen, [0, 0, np.linalg.norm(target - eye)], atol=1e-9)
+    np.testing.assert_allclose(seen, np.array([0, 0, np.linalg.norm(target - eye)]), atol=1e-9)
     higher = T_world_camera.inverse().apply(target + np.array([0, 0, 0.1]))
     assert abs(higher[0]) < 1e-9  # +x right
     assert higher[1] < 0  # +y down

@@ -15,9 +15,9 @@ from tesnet import candidates, weights
 from tesnet.geometry import Pose
 from tesnet.networks import Network
 from tesnet.predictor import GraspPredictor
-from tesnet.query import GraspQuery
 from tests.tesnet.scenes import (
     CAMERA,
+    ask,
     fresh_network,
     fresh_predictor,
     moved_cloud,
@@ -53,7 +53,7 @@ def test_for_a_prepared_cloud_scores_are_invariant_and_grasps_equivariant(
     which: str, seed: int, scene: int, with_up: bool
 ) -> None:
     motion = random_motion(np.random.default_rng(seed))
-    query = tabletop_query(scene) if with_up else GraspQuery(tabletop(scene), viewpoints=CAMERA)
+    query = tabletop_query(scene) if with_up else ask(tabletop(scene), viewpoints=CAMERA)
     query = replace(query, max_candidates=200)
     still = prepared(query)
     moved = moved_cloud(still, motion)

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+from typing import Any
 
 import numpy as np
 import pytest
@@ -9,8 +10,7 @@ import torch
 from tesnet import candidates, cloud, networks
 from tesnet.candidates import Candidates
 from tesnet.networks.tesnet import CloudFeatures, edge_inputs, point_inputs
-from tesnet.query import GraspQuery
-from tests.tesnet.scenes import CAMERA, fresh_network, prepared, tabletop, tabletop_query
+from tests.tesnet.scenes import CAMERA, ask, fresh_network, prepared, tabletop, tabletop_query
 
 
 @functools.cache
@@ -106,8 +106,8 @@ def test_point_pair_features_are_distances_and_cosines() -> None:
 
 
 @pytest.mark.parametrize(("options", "known"), [({}, 0), ({"up": [0, 0, 1]}, 1)])
-def test_what_the_caller_does_not_know_is_zero(options: dict[str, list[float]], known: int) -> None:
-    inputs = point_inputs(prepared(GraspQuery(tabletop(0), viewpoints=CAMERA, up=options.get("up"))))
+def test_what_the_caller_does_not_know_is_zero(options: dict[str, Any], known: int) -> None:
+    inputs = point_inputs(prepared(ask(tabletop(0), viewpoints=CAMERA, up=options.get("up"))))
     assert inputs.shape[1] == 7
     assert (inputs[:, 4] == known).all()  # whether up is known
     assert (inputs[:, 5:] == 0).all()  # height and whether it is known

@@ -9,8 +9,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tesnet.errors import InvalidQuery, TesnetError
-from tesnet.query import ApproachCone, Box, GraspQuery
-from tests.tesnet.scenes import UP
+from tesnet.query import ApproachCone, Box
+from tests.tesnet.scenes import UP, ask
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
 
@@ -73,14 +73,14 @@ BAD_OPTIONS: list[tuple[str, dict[str, Any], str]] = [
 @pytest.mark.parametrize(("points", "says"), BAD_POINTS)
 def test_bad_points_are_refused_with_value_limit_and_remedy(points: Any, says: str) -> None:
     with pytest.raises(InvalidQuery, match=says) as caught:
-        GraspQuery(points)
+        ask(points)
     assert caught.value.field == "points"
 
 
 @pytest.mark.parametrize(("field", "options", "says"), BAD_OPTIONS)
 def test_bad_options_are_refused_with_value_limit_and_remedy(field: str, options: dict[str, Any], says: str) -> None:
     with pytest.raises(InvalidQuery, match=says) as caught:
-        GraspQuery(POINTS, **options)
+        ask(POINTS, **options)
     assert caught.value.field == field
     assert str(caught.value).startswith(f"{field}: ")
     assert isinstance(caught.value, TesnetError)
@@ -112,7 +112,7 @@ def test_a_cone_has_an_angle_between_0_and_180_degrees(angle: float) -> None:
 def test_any_cloud_is_either_taken_or_refused(seed: int, size: int, scale: float) -> None:
     points = np.random.default_rng(seed).normal(size=(size, 3)) * scale
     try:
-        query = GraspQuery(points)
+        query = ask(points)
     except InvalidQuery as error:
         assert error.field == "points"  # noqa: PT017  either outcome is right
     else:
@@ -122,12 +122,12 @@ def test_any_cloud_is_either_taken_or_refused(seed: int, size: int, scale: float
 
 def test_far_outliers_do_not_make_a_cloud_look_like_millimetres() -> None:
     points = np.vstack([POINTS, [[1e5, 0, 0]], [[0, -1e7, 0]]])
-    assert len(GraspQuery(points).points) == 52
+    assert len(ask(points).points) == 52
 
 
 def test_a_query_copies_its_arrays_and_keeps_them_read_only() -> None:
     points, viewpoint = POINTS.copy(), np.array([0.0, 0.0, 1.0])
-    query = GraspQuery(points, viewpoints=viewpoint, up=viewpoint)
+    query = ask(points, viewpoints=viewpoint, up=viewpoint)
     points[:], viewpoint[:] = 9, 9
     assert query.points.dtype == np.float32
     np.testing.assert_allclose(query.points, POINTS, atol=1e-7)
@@ -140,7 +140,7 @@ def test_a_query_copies_its_arrays_and_keeps_them_read_only() -> None:
 
 
 def test_directions_become_unit_vectors_and_limits_are_inclusive() -> None:
-    query = GraspQuery(
+    query = ask(
         POINTS,
         viewpoints=np.zeros((64, 3)),
         up=np.array([0, 0, 7.0]),
@@ -160,5 +160,5 @@ def test_directions_become_unit_vectors_and_limits_are_inclusive() -> None:
 
 
 def test_whole_numbers_of_numpy_are_whole_numbers() -> None:
-    query = GraspQuery(POINTS, max_grasps=np.int64(3), seed=np.uint32(7), min_score=np.float32(0.5))
+    query = ask(POINTS, max_grasps=np.int64(3), seed=np.uint32(7), min_score=np.float32(0.5))
     assert query.max_grasps == 3

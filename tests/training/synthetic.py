@@ -1,0 +1,46 @@
+"""Labelled views without a simulator: real candidates of a made-up scene, called successes where they are shallow."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import torch
+
+from tesnet import candidates
+from tests.tesnet.scenes import prepared, tabletop_query
+from training.labels import OUTCOMES, LabelledView, save_scene
+
+
+def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) -> LabelledView:
+    """A view of `tabletop(seed)` with `count` labels, all of candidates that count as free of collision.
+
+    Args:
+        seed: of scene and sampling.
+        count: labels.
+        positives: so many are successes; a third unless given.
+    """
+    query = tabletop_query(seed, max_candidates=count)
+    ready = prepared(query)
+    found, _ = candidates.generate(ready, query, candidates.CandidateConfig())
+    assert len(found) == count
+    depth = (ready.points[found.contact] - ready.points[found.approach]).norm(dim=1)
+    successes = depth.argsort()[: count // 3 if positives is None else positives]
+    outcomes = torch.full((count,), OUTCOMES.index("approach"), dtype=torch.uint8)
+    outcomes[successes] = OUTCOMES.index("success")
+    return LabelledView(
+        cloud=ready,
+        candidates=found,
+        outcomes=outcomes,
+        collision_free=torch.ones(count, dtype=torch.bool),
+        scene="packed",
+    )
+
+
+def write(folder: Path, views: list[LabelledView]) -> Path:
+    """The views, one scene file each, in a folder."""
+    folder.mkdir(parents=True, exist_ok=True)
+    for number, view in enumerate(views):
+        counts = np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES)).astype(np.int64)
+        save_scene(folder / f"scene_{number:07d}.npz", {"number": number}, [view], counts)
+    return folder

@@ -1,0 +1,74 @@
+from __future__ import annotations
+
+import json
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.generate import GenerateConfig, generate
+from training.labels import OUTCOMES, LabelsError, load_scene, scene_files
+
+pytestmark = pytest.mark.sim
+
+CONFIG = GenerateConfig("packed", "procedural-train", seed=5, views=1, labels_per_view=6, colliding_share=0.5)
+
+
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    """A handful of labels, really simulated."""
+    out = tmp_path_factory.mktemp("generate") / "first"
+    generate(CONFIG, 1, 1, out)
+    return out
+
+
+def arrays(path: Path) -> dict[str, bytes]:
+    with np.load(path, allow_pickle=False) as stored:
+        return {name: stored[name].tobytes() for name in stored.files}
+
+
+def test_labels_come_with_all_that_is_needed_to_see_the_scene_again(labels: Path) -> None:
+    account = json.loads((labels / "account.json").read_text())
+    files = scene_files([labels])
+    assert account["scenes"] == len(files)
+    assert account["labels"] == sum(account["outcomes"].values()) >= 1
+    assert list(account["outcomes"]) == list(OUTCOMES)
+    total = 0
+    for path in files:
+        description, views = load_scene(path)
+        assert {"seed", "number", "cameras"} <= set(description)
+        assert len(views) <= 1
+        for view in views:
+            total += len(view.outcomes)
+            assert len(view.outcomes) <= 6
+            assert view.scene == "packed"
+            assert view.outcomes.max() < len(OUTCOMES)
+            assert int((~view.collision_free).sum()) <= 3
+    assert total == account["labels"]
+
+
+def test_a_second_run_gives_equal_labels_and_a_longer_one_goes_on(labels: Path, tmp_path: Path) -> None:
+    generate(CONFIG, 1, 1, tmp_path / "second")
+    first, second = scene_files([labels]), scene_files([tmp_path / "second"])
+    assert [path.name for path in first] == [path.name for path in second]
+    for one, other in zip(first, second, strict=True):
+        assert arrays(one) == arrays(other)
+
+    before = {path.name: path.stat().st_mtime_ns for path in second}
+    account = json.loads((tmp_path / "second" / "account.json").read_text())
+    longer = generate(CONFIG, account["labels"] + 1, 1, tmp_path / "second", resume=True)
+    assert longer["labels"] > account["labels"]
+    assert longer["scenes"] > account["scenes"]
+    after = {path.name: path.stat().st_mtime_ns for path in scene_files([tmp_path / "second"])}
+    assert {name: after[name] for name in before} == before
+
+
+def test_a_folder_of_labels_is_not_taken_over_unasked(labels: Path) -> None:
+    with pytest.raises(LabelsError, match="add --resume"):
+        generate(CONFIG, 1, 1, labels)
+
+
+def test_a_folder_of_other_settings_is_refused(labels: Path) -> None:
+    with pytest.raises(LabelsError, match=r"other settings \(seed: 5\)"):
+        generate(replace(CONFIG, seed=6), 1, 1, labels, resume=True)

@@ -1,0 +1,76 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tests.training.synthetic import labelled_view, write
+from training.labels import LabelsError, load_scene, load_views, save_scene, scene_files
+
+
+def test_labels_round_trip(tmp_path: Path) -> None:
+    first, second = labelled_view(0), labelled_view(1, count=40)
+    path = tmp_path / "scene_0000000.npz"
+    save_scene(path, {"seed": 3, "objects": ["a", "b"]}, [first, second], np.array([20, 0, 40, 0, 0]))
+    description, views = load_scene(path)
+    assert description == {"seed": 3, "objects": ["a", "b"]}
+    assert len(views) == 2
+    for before, after in zip((first, second), views, strict=True):
+        assert torch.equal(before.outcomes, after.outcomes)
+        assert torch.equal(before.success, after.success)
+        assert torch.equal(before.collision_free, after.collision_free)
+        assert torch.equal(before.candidates.approach, after.candidates.approach)
+        assert torch.equal(before.candidates.contact, after.candidates.contact)
+        assert torch.equal(before.cloud.neighbours, after.cloud.neighbours)
+        assert after.scene == "packed"
+        # float16 coordinates: 0.06 mm at 0.1 m, 0.12 mm beyond 0.125 m; half of that by rounding.
+        torch.testing.assert_close(after.cloud.points, before.cloud.points, atol=7e-5, rtol=0)
+        tried, stored = before.candidates.Ts_canonical_grasp, after.candidates.Ts_canonical_grasp
+        torch.testing.assert_close(stored[:, :3, 3], tried[:, :3, 3], atol=2e-3, rtol=0)
+        cosines = (stored[:, :3, 1] * tried[:, :3, 1]).sum(dim=1)
+        assert cosines.min() > 0.999
+        facing = (after.cloud.normals * after.cloud.view_directions).sum(dim=1)
+        assert (facing >= 0).all()
+        agree = (after.cloud.normals * before.cloud.normals).sum(dim=1)
+        assert (agree > 0.99).float().mean() > 0.9
+        assert before.cloud.up is not None
+        assert after.cloud.up is not None
+        torch.testing.assert_close(after.cloud.up, before.cloud.up)
+        assert after.cloud.support_height == before.cloud.support_height
+        np.testing.assert_array_equal(after.cloud.T_cloud_canonical.matrix, before.cloud.T_cloud_canonical.matrix)
+
+
+def test_a_scene_without_views_round_trips(tmp_path: Path) -> None:
+    save_scene(tmp_path / "scene_0.npz", {"number": 0}, [], np.zeros(5, dtype=np.int64))
+    assert load_scene(tmp_path / "scene_0.npz") == ({"number": 0}, [])
+
+
+@pytest.mark.parametrize("damage", ["empty", "cut", "text", "other"])
+def test_a_damaged_file_is_refused(tmp_path: Path, damage: str) -> None:
+    path = tmp_path / "scene_0.npz"
+    save_scene(path, {}, [labelled_view(count=30)], np.zeros(5, dtype=np.int64))
+    if damage == "other":
+        np.savez(path, allow_pickle=False, a=np.zeros(3))
+    else:
+        path.write_bytes({"empty": b"", "cut": path.read_bytes()[:-500], "text": b"labels\n" * 50}[damage])
+    with pytest.raises(LabelsError, match="remove it and generate again"):
+        load_scene(path)
+
+
+def test_scenes_are_read_in_order_from_every_folder(tmp_path: Path) -> None:
+    view = labelled_view(count=30)
+    for name in ("b/scene_0000001.npz", "b/scene_0000000.npz", "a/deep/scene_0000005.npz"):
+        (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
+        save_scene(tmp_path / name, {}, [view], np.zeros(5, dtype=np.int64))
+    files = scene_files([tmp_path / "b", tmp_path / "a"])
+    assert [path.name for path in files] == ["scene_0000000.npz", "scene_0000001.npz", "scene_0000005.npz"]
+    assert sum(1 for _ in load_views([tmp_path])) == 3
+    with pytest.raises(LabelsError, match="python -m training generate"):
+        scene_files([tmp_path / "c"])
+
+
+def test_writing_leaves_no_temporary_file(tmp_path: Path) -> None:
+    write(tmp_path, [labelled_view(count=30)])
+    assert [path.name for path in tmp_path.iterdir()] == ["scene_0000000.npz"]
