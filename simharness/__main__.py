@@ -41,6 +41,7 @@ EXIT_BROKEN = 3
 DEFAULT_OBJECTS: dict[SceneKind, str] = {"packed": "procedural", "pile": "pybullet-random"}
 DEFAULT_WORKERS = min(2, os.cpu_count() or 1)
 MAX_GRASPS_WATCHED = 10
+MAX_PORT = 65535
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -135,11 +136,18 @@ def _run_parser() -> argparse.ArgumentParser:
         prog="python -m simharness",
         description="Clear simulated tables through the grasp service and report success rates. "
         "`python -m simharness replay DIR --attempt K` shows one attempt again.",
+        epilog="Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker "
+        "failed, and what was done is kept for --resume.",
         allow_abbrev=False,
     )
     add = parser.add_argument
-    add("--rounds", type=_at_least(1), default=100, help="rounds for each seed (default %(default)s)")
-    add("--scene", choices=get_args(SceneKind), default="packed", help="default %(default)s")
+    add("--rounds", type=_at_least(1), default=100, metavar="N", help="rounds for each seed (default %(default)s)")
+    add(
+        "--scene",
+        choices=get_args(SceneKind),
+        default="packed",
+        help="packed: objects stand apart; pile: objects are poured (default %(default)s)",
+    )
     add(
         "--objects",
         metavar="NAME_OR_PATH",
@@ -148,7 +156,13 @@ def _run_parser() -> argparse.ArgumentParser:
     )
     add("--exclude", metavar="LIST", help="file with names of objects to leave out")
     add("--only", metavar="LIST", help="file with names of objects to use alone")
-    add("--camera", choices=PRESETS, default="random", help="default %(default)s")
+    add(
+        "--camera",
+        choices=PRESETS,
+        default="random",
+        help="random: one view from somewhere above; giga: one fixed view from the side; multi3: three views; "
+        "vgn6: six views (default %(default)s)",
+    )
     add(
         "--noise-std",
         type=_not_negative,
@@ -156,22 +170,33 @@ def _run_parser() -> argparse.ArgumentParser:
         help="noise on each coordinate of each point, metres (default: the camera's)",
     )
     add("--depth-noise-std", type=_not_negative, metavar="M", help="noise on depth, metres (default: the camera's)")
-    add("--executor", choices=get_args(Executor), default="edge", help="how grasps are judged (default %(default)s)")
+    add(
+        "--executor",
+        choices=get_args(Executor),
+        default="edge",
+        help="edge: contacts on the way push, as in published harnesses; strict: a contact before closing is a "
+        "failure, and both fingers must hold the same object (default %(default)s)",
+    )
     seeds = parser.add_mutually_exclusive_group()
-    seeds.add_argument("--seed", type=_at_least(0), help="run seed (default 0)")
+    seeds.add_argument("--seed", type=_at_least(0), metavar="SEED", help="run seed (default 0)")
     seeds.add_argument("--seeds", type=_at_least(0), nargs="+", metavar="SEED", help="several run seeds, pooled")
     add(
-        "--workers", type=_at_least(1), default=DEFAULT_WORKERS, help="processes that play rounds (default %(default)s)"
+        "--workers",
+        type=_at_least(1),
+        default=DEFAULT_WORKERS,
+        metavar="N",
+        help="processes that play rounds; results do not depend on it (default %(default)s)",
     )
-    add("--model", default="tesnet", help="network to ask for (default %(default)s)")
+    add("--model", default="tesnet", metavar="NAME", help="network to ask for (default %(default)s)")
     add("--url", help="a running service (default: one is started for the run)")
     add("--out", type=Path, metavar="DIR", help="where the reports go (default: a new folder in runs/)")
     add("--resume", action="store_true", help="continue the run in --out")
     add("--watch", action="store_true", help="show the run live in a browser page; plays with one worker")
     add(
         "--watch-port",
-        type=_at_least(0),
+        type=_port,
         default=8080,
+        metavar="PORT",
         help="port of that page; the next free one is taken (default %(default)s)",
     )
     return parser
@@ -239,6 +264,13 @@ def _at_least(minimum: int) -> Any:
         return value
 
     return parse
+
+
+def _port(text: str) -> int:
+    port: int = _at_least(0)(text)
+    if port > MAX_PORT:
+        raise argparse.ArgumentTypeError(f"{port} is no port; give 0 to {MAX_PORT}")
+    return port
 
 
 def _not_negative(text: str) -> float:

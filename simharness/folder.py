@@ -101,7 +101,7 @@ class RunFolder:
             values = json.loads(self._file(RUN_FILE).read_text(encoding="utf-8"))
             settings = RunSettings.from_json(values["settings"])
             return settings, ModelRecord(**values["model"]), Serving(**values["serving"])
-        except FileNotFoundError:
+        except (FileNotFoundError, NotADirectoryError):
             raise UsageError(f"{self.path} holds no run ({RUN_FILE} is missing); give the --out of a run") from None
         except (ValueError, KeyError, TypeError) as error:
             raise UsageError(f"{self._file(RUN_FILE)} cannot be read ({error}); give another --out") from error

@@ -10,7 +10,7 @@ from pathlib import Path
 from typing import Any
 
 from simharness.metrics import Rate, Summary, summarise
-from simharness.photographer import VIEWS, picture_name
+from simharness.photographer import FAILURES, FIRST_ROUNDS, VIEWS, picture_name
 from simharness.records import AttemptRecord
 from simharness.report import percent, times, title
 from simharness.run import Run
@@ -20,12 +20,17 @@ _OUTCOME_COLOURS = {
     "pregrasp": "#7c3aed",
     "approach": "#d97706",
     "slip": "#dc2626",
-    "drop": "#db2777",
+    "drop": "#0284c7",
 }
 _END_COLOURS = {"empty": "#16a34a", "two_failures": "#dc2626", "no_grasps": "#64748b"}
+_END_MEANINGS = {
+    "empty": "the table is empty",
+    "two_failures": "attempts in a row failed",
+    "no_grasps": "three looks in a row gave none",
+}
 _OUTCOME_MEANINGS = {
     "success": "lifted and held",
-    "pregrasp": "contact where the hand appeared",
+    "pregrasp": "contact before the approach",
     "approach": "contact on the way",
     "slip": "nothing held after closing",
     "drop": "lost while lifting",
@@ -33,8 +38,18 @@ _OUTCOME_MEANINGS = {
 _VIEW_TITLES = {
     "colour": "Camera, colour",
     "segmentation": "Camera, segmentation",
-    "cloud": "Cloud with the executed grasp",
+    "cloud": "Cloud with the executed grasp; grid 5 cm",
 }
+_UNSET = {
+    "exclude": "none",
+    "only": "none",
+    "noise_std": "the camera's own",
+    "depth_noise_std": "the camera's own",
+    "url": "started for the run",
+    "service_threads": "unknown",
+    "device": "unknown",
+}
+"""What it means that a setting was not given."""
 
 
 def page(run: Run, content: Mapping[str, Any], shown: Sequence[AttemptRecord], pictures: Path) -> str:
@@ -49,7 +64,7 @@ def page(run: Run, content: Mapping[str, Any], shown: Sequence[AttemptRecord], p
     summary = summarise(run.rounds)
     sections = [
         f"<h1>Clutter removal, {run.settings.scene} scenes</h1>",
-        f'<p class="subtitle">{escape(title(run))}</p>',
+        f'<p class="subtitle">{escape(title(run).replace(" | ", " · "))}</p>',
         "" if run.complete else _warning(run),
         '<div class="cards">',
         _rate_card("Grasp success rate (GSR)", summary.gsr, "grasps attempted"),
@@ -63,9 +78,14 @@ def page(run: Run, content: Mapping[str, Any], shown: Sequence[AttemptRecord], p
         "</div>",
         _attempts(shown, pictures),
         "<h2>Settings</h2>",
-        _table((name.replace("_", " "), _plain(value)) for name, value in content["settings"].items()),
+        _table((_words(name), _setting(name, value)) for name, value in content["settings"].items()),
         "<h2>Model and packages</h2>",
-        _table([*(content["model"] or {}).items(), *content["versions"].items()]),
+        _table(
+            [
+                *((f"model {_words(name)}", str(value)) for name, value in (content["model"] or {}).items()),
+                *content["versions"].items(),
+            ]
+        ),
     ]
     body = "\n".join(section for section in sections if section)
     return (
@@ -89,87 +109,77 @@ def _warning(run: Run) -> str:
 
 
 def _rate_card(name: str, rate: Rate, what: str) -> str:
-    low, high = rate.interval
     return (
         f'<div class="card"><h3>{escape(name)}</h3><div class="value">{percent(rate)}</div>{_interval(rate)}'
         f'<div class="note">{rate.count} of {rate.total} {escape(what)}; 95 % Wilson interval '
-        f"{100 * low:.1f} to {100 * high:.1f} %</div></div>"
+        f"{_limits(rate)}</div></div>"
     )
+
+
+def _limits(rate: Rate) -> str:
+    low, high = rate.interval
+    return f"{100 * low:.1f} to {100 * high:.1f} %"
 
 
 def _interval(rate: Rate) -> str:
     """A bar from 0 to 100 % with the interval and the rate."""
     low, high = (100 * limit for limit in rate.interval)
-    ticks = "".join(
-        f'<line x1="{4 + 3.92 * at}" y1="20" x2="{4 + 3.92 * at}" y2="24" stroke="#94a3b8"/>'
-        f'<text x="{4 + 3.92 * at}" y="36" font-size="10" fill="#64748b" text-anchor="{anchor}">{at}</text>'
-        for at, anchor in ((0, "start"), (25, "middle"), (50, "middle"), (75, "middle"), (100, "end"))
+    dot = "" if rate.value is None else f'<b style="left:{100 * rate.value:.2f}%"></b>'
+    ticks = "".join(f'<span style="left:{at}%">{at}</span>' for at in (0, 25, 50, 75, 100))
+    return (
+        '<div class="interval" role="img" aria-label="rate with interval">'
+        f'<div class="track"><i style="left:{low:.2f}%;width:{high - low:.2f}%"></i>{dot}</div>'
+        f'<div class="ticks">{ticks}</div></div>'
     )
-    dot = (
-        ""
-        if rate.value is None
-        else f'<circle cx="{4 + 392 * rate.value:.2f}" cy="11" r="6" fill="#2563eb" stroke="#fff" stroke-width="2"/>'
+
+
+def _shares(entries: Sequence[tuple[str, int, str, str]]) -> str:
+    """A bar divided in proportion to counts, and what its parts are: name, count, colour, meaning."""
+    total = sum(count for _, count, _, _ in entries)
+    pieces = "".join(
+        f'<i style="flex-grow:{count};background:{colour}"></i>' for _, count, colour, _ in entries if count
+    )
+    rows = "".join(
+        f'<tr{"" if count else " class=none"}><td><i style="background:{colour}"></i>{escape(_words(name))}</td>'
+        f"<td>{count}</td><td>{_share(count, total)}</td><td>{escape(meaning)}</td></tr>"
+        for name, count, colour, meaning in entries
     )
     return (
-        '<svg viewBox="0 0 400 40" role="img" aria-label="rate with interval">'
-        '<rect x="4" y="7" width="392" height="8" rx="4" fill="#e2e8f0"/>'
-        f'<rect x="{4 + 3.92 * low:.2f}" y="7" width="{3.92 * (high - low):.2f}" height="8" rx="4" fill="#93c5fd"/>'
-        f"{dot}{ticks}</svg>"
+        f'<div class="stack" role="img" aria-label="shares">{pieces}</div>'
+        f'<table class="legend"><tbody>{rows}</tbody></table>'
     )
 
 
-def _stack(parts: Sequence[tuple[int, str]]) -> str:
-    """A bar divided in proportion to counts."""
-    total = sum(count for count, _ in parts)
-    pieces, at = [], 0.0
-    for count, colour in parts:
-        if count:
-            width = 400 * count / total
-            pieces.append(
-                f'<rect x="{at:.2f}" y="0" width="{max(width - 1.5, 0.5):.2f}" height="18" rx="3" fill="{colour}"/>'
-            )
-            at += width
-    empty = '<rect x="0" y="0" width="400" height="18" rx="3" fill="#e2e8f0"/>' if not total else ""
-    return f'<svg viewBox="0 0 400 18" role="img" aria-label="shares">{empty}{"".join(pieces)}</svg>'
-
-
-def _legend(entries: Iterable[tuple[str, int, str, str]]) -> str:
-    items = "".join(
-        f'<li><i style="background:{colour}"></i>{escape(name.replace("_", " "))} <b>{count}</b> '
-        f"<span>{escape(note)}</span></li>"
-        for name, count, colour, note in entries
-    )
-    return f'<ul class="legend">{items}</ul>'
+def _share(count: int, total: int) -> str:
+    return f"{100 * count / total:.0f} %" if total else ""
 
 
 def _outcomes(summary: Summary) -> str:
     outcomes = {"success": summary.gsr.count, **summary.failures}
     entries = [(kind, count, _OUTCOME_COLOURS[kind], _OUTCOME_MEANINGS[kind]) for kind, count in outcomes.items()]
-    return (
-        '<div class="card"><h3>Attempts by outcome</h3>'
-        f"{_stack([(count, colour) for _, count, colour, _ in entries])}{_legend(entries)}</div>"
-    )
+    return f'<div class="card"><h3>Attempts by outcome</h3>{_shares(entries)}</div>'
 
 
 def _ends(summary: Summary) -> str:
-    entries = [(way, count, _END_COLOURS[way], "") for way, count in summary.ended.items()]
-    nothing = ", ".join(f"{escape(reason)} {count}" for reason, count in summary.no_grasps.items()) or "none"
+    entries = [(way, count, _END_COLOURS[way], _END_MEANINGS[way]) for way, count in summary.ended.items()]
+    nothing = ", ".join(f"{escape(_words(reason))} {count}" for reason, count in summary.no_grasps.items()) or "none"
     return (
-        f'<div class="card"><h3>Rounds by end</h3>{_stack([(count, colour) for _, count, colour, _ in entries])}'
-        f'{_legend(entries)}<div class="note">Observations without a grasp: {nothing}</div></div>'
+        f'<div class="card"><h3>Rounds by end</h3>{_shares(entries)}'
+        f'<div class="note">Observations without a grasp: {nothing}</div></div>'
     )
 
 
 def _latencies(summary: Summary) -> str:
     return (
-        f'<div class="card"><h3>Latency of a request, median</h3><div class="value">{escape(_median(summary))}</div>'
+        '<div class="card"><h3>Time of a request, median</h3>'
+        f'<div class="value">{escape(_median(summary))}</div>'
         f'<div class="note">inside the service {times(summary.service_ms)}<br>'
-        f"round trip {times(summary.round_trip_ms)}</div></div>"
+        f"as the harness saw it {times(summary.round_trip_ms)}</div></div>"
     )
 
 
 def _median(summary: Summary) -> str:
-    median = summary.service_ms.median
+    median = summary.service_ms.median if summary.service_ms.median is not None else summary.round_trip_ms.median
     return "-" if median is None else f"{median:.0f} ms"
 
 
@@ -180,7 +190,8 @@ def _seeds(run: Run) -> str:
     for seed in run.settings.seeds:
         summary = summarise(record for record in run.rounds if record.seed == seed)
         cells = "".join(
-            f"<td>{percent(rate)} ({rate.count} of {rate.total})</td>" for rate in (summary.gsr, summary.dr)
+            f"<td>{percent(rate)} <small>{rate.count} of {rate.total}; {_limits(rate)}</small></td>"
+            for rate in (summary.gsr, summary.dr)
         )
         rows.append(f"<tr><td>{seed}</td>{cells}</tr>")
     return f'<h2>By seed</h2><div class="table"><table>{"".join(rows)}</table></div>'
@@ -188,7 +199,13 @@ def _seeds(run: Run) -> str:
 
 def _attempts(shown: Sequence[AttemptRecord], pictures: Path) -> str:
     cards = [_attempt(attempt, pictures) for attempt in shown]
-    return "\n".join(["<h2>Attempts</h2>", *cards]) if cards else ""
+    if not cards:
+        return ""
+    note = (
+        f'<p class="subtitle">The first attempt of each of the first {FIRST_ROUNDS} rounds, then the earliest '
+        f"failures, at most {FAILURES}. The score is the probability of success that the model gave.</p>"
+    )
+    return "\n".join(["<h2>Some of the attempts</h2>", note, *cards])
 
 
 def _attempt(attempt: AttemptRecord, pictures: Path) -> str:
@@ -198,7 +215,9 @@ def _attempt(attempt: AttemptRecord, pictures: Path) -> str:
         for view in VIEWS
         if (path := pictures / picture_name(attempt, view)).exists()
     )
-    lifted = f"lifted {', '.join(attempt.grasped)}" if attempt.grasped else f"of {', '.join(attempt.objects)}"
+    lifted = (
+        f"lifted {', '.join(attempt.grasped)}" if attempt.grasped else f"on the table: {', '.join(attempt.objects)}"
+    )
     return (
         '<div class="attempt"><header>'
         f'<span class="badge" style="background:{_OUTCOME_COLOURS[attempt.outcome]}">{escape(attempt.outcome)}</span>'
@@ -216,7 +235,11 @@ def _table(rows: Iterable[tuple[str, Any]]) -> str:
     return f'<div class="table"><table>{cells}</table></div>'
 
 
-def _plain(value: Any) -> str:
-    if isinstance(value, list):
-        return ", ".join(map(str, value))
-    return "default" if value is None else str(value)
+def _words(name: str) -> str:
+    return name.replace("_", " ")
+
+
+def _setting(name: str, value: Any) -> str:
+    if value is None:
+        return _UNSET.get(name, "none")
+    return ", ".join(map(str, value)) if isinstance(value, list) else str(value)

@@ -17,6 +17,7 @@ from simharness.pictures import (
     png,
     point_colours,
     segmentation_colours,
+    widen,
 )
 from simharness.records import AttemptRecord, RoundRecord, RunSettings
 from simharness.round import Attempted, Observed
@@ -101,20 +102,21 @@ def attempt_pictures(event: Attempted) -> dict[str, bytes]:
         event.before.view.viewpoints[0],
     )
     segmentation = segmentation_colours(images.segmentation, event.before.objects)
-    camera = Pose.from_matrix(event.before.view.Ts_world_camera[0])
+    part = close_up(images.segmentation, event.before.objects)
     return {
-        "colour": png(close_up(images.colour, camera, INTRINSICS)),
-        "segmentation": png(close_up(segmentation, camera, INTRINSICS)),
+        "colour": png(images.colour[part]),
+        "segmentation": png(segmentation[part]),
         "cloud": png(cloud),
     }
 
 
 def observed_colours(observed: Observed) -> UInt8[np.ndarray, "points 3"]:
-    """Colours of a cloud's points, from the first camera's image."""
+    """Colours of a cloud's points, from the objects in the first camera's image."""
     view = observed.view
-    return point_colours(
-        view.points_world, view.images[0].colour, Pose.from_matrix(view.Ts_world_camera[0]), INTRINSICS
-    )
+    images = view.images[0]
+    # Noise moves points at an object's edge over the table's pixels; the table itself is in no cloud.
+    colour = widen(images.colour, np.isin(images.segmentation, list(observed.objects)))
+    return point_colours(view.points_world, colour, Pose.from_matrix(view.Ts_world_camera[0]), INTRINSICS)
 
 
 def _is_first(attempt: AttemptRecord) -> bool:

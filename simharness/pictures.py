@@ -9,12 +9,14 @@ import io
 from collections.abc import Iterable
 
 import numpy as np
-from jaxtyping import Float, Float32, Float64, Int32, UInt8
+from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 from PIL import Image, ImageDraw
+from scipy.ndimage import distance_transform_edt
 
+from simharness.scene import TABLE_HEIGHT, WORKSPACE
 from tesnet.geometry import PANDA, CameraIntrinsics, Pose
 
-PICTURE_SIZE = (320, 240)
+PICTURE_SIZE = (480, 360)
 """Width and height of a stored picture, pixels."""
 
 SUCCESS_COLOUR = (22, 163, 74)
@@ -23,35 +25,46 @@ OTHER_COLOUR = (148, 163, 184)
 """Of the hand: an attempt that succeeded, one that failed, a grasp that was not carried out."""
 
 _BACKGROUND = (246, 247, 249)
-_CLOUD_CAMERA = CameraIntrinsics(640, 480, 980, 980, 320, 250)
-_CLOUD_DISTANCE = 0.5
-_POINT_RADIUS_PX = 3
-_LINE_PX = 4
+_TABLE = (236, 239, 243)
+_GRID = (214, 219, 226)
+_GRID_STEP = 0.05
+
+_CANVAS_PX = (960, 720)
+"""Width and height in which the cloud is drawn, before it is scaled down."""
+
+_CLOUD_DISTANCE = 0.6
+_CLOUD_MARGIN = 0.1
+_LONGEST_FOCAL_PX = 3200.0
+_POINT_RADIUS = 0.0016
+_LINE_PX = 8
+_HALO_PX = 4
+_HIDDEN_ALPHA = 90
+_HIDDEN_BEHIND = 0.003
+"""Metres: what is so far behind a point is hidden by it."""
 
 _TABLE_MIDDLE = np.array([0.15, 0.15, 0.10])
-"""Metres in the world: where pictures look."""
+"""Metres in the world: where the cloud's pictures look."""
 
-_CLOSE_UP_PX = (320, 240)
-"""Width and height of the part of a camera image that shows the workspace."""
+_CLOSE_UP_PX = (160, 120)
+"""The least width and height of the part of a camera image that shows the objects."""
+
+_CLOSE_UP_MARGIN = 1.3
 
 _PALETTE = np.array(
     [
-        (230, 159, 0),
-        (86, 180, 233),
-        (0, 158, 115),
-        (240, 228, 66),
         (0, 114, 178),
-        (213, 94, 0),
+        (230, 159, 0),
+        (0, 158, 115),
         (204, 121, 167),
+        (86, 180, 233),
+        (213, 94, 0),
         (120, 94, 240),
-        (254, 97, 0),
-        (100, 143, 255),
-        (181, 137, 110),
-        (34, 197, 94),
+        (240, 228, 66),
     ],
     dtype=np.uint8,
 )
-"""Colours that people with any colour vision can tell apart (Okabe and Ito 2008, with six more)."""
+"""Colours that people with any colour vision can tell apart (Okabe and Ito 2008, with one more); bodies that are loaded
+one after the other get neighbours."""
 
 
 def segmentation_colours(
@@ -71,15 +84,35 @@ def segmentation_colours(
     return image
 
 
-def close_up(
-    image: UInt8[np.ndarray, "height width 3"], T_world_camera: Pose, intrinsics: CameraIntrinsics
-) -> UInt8[np.ndarray, "close_height close_width 3"]:
-    """The part of a camera image around the middle of the workspace."""
-    (column, row), _ = (values[0] for values in _project(_TABLE_MIDDLE[None], T_world_camera, intrinsics))
-    width, height = _CLOSE_UP_PX
-    left = int(np.clip(column - width / 2, 0, intrinsics.width - width))
-    top = int(np.clip(row - height / 2, 0, intrinsics.height - height))
-    return image[top : top + height, left : left + width]
+def close_up(bodies: Int32[np.ndarray, "height width"], objects: Iterable[int]) -> tuple[slice, slice]:
+    """Rows and columns of the part of a camera image that shows the objects, as wide to high as a picture.
+
+    Args:
+        bodies: body ids.
+        objects: ids of the graspable bodies; where none is seen, the part is the whole image.
+    """
+    height, width = bodies.shape
+    rows, columns = np.nonzero(np.isin(bodies, list(objects)))
+    if not len(rows):
+        return slice(0, height), slice(0, width)
+    aspect = PICTURE_SIZE[0] / PICTURE_SIZE[1]
+    needed = _CLOSE_UP_MARGIN * max(float(np.ptp(columns)), aspect * float(np.ptp(rows)))
+    wide = round(min(max(needed, _CLOSE_UP_PX[0]), width, aspect * height))
+    high = round(wide / aspect)
+    left = int(np.clip((columns.min() + columns.max() - wide) / 2, 0, width - wide))
+    top = int(np.clip((rows.min() + rows.max() - high) / 2, 0, height - high))
+    return slice(top, top + high), slice(left, left + wide)
+
+
+def widen(
+    image: UInt8[np.ndarray, "height width 3"], known: Bool[np.ndarray, "height width"]
+) -> UInt8[np.ndarray, "height width 3"]:
+    """An image in which every pixel has the colour of the nearest known one."""
+    if not known.any():
+        return image
+    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
+    widened: UInt8[np.ndarray, "height width 3"] = image[rows, columns]
+    return widened
 
 
 def point_colours(
@@ -98,9 +131,9 @@ def point_colours(
 
 
 def hand_lines(T_world_grasp: Float[np.ndarray, "4 4"], width: float) -> Float64[np.ndarray, "lines 2 3"]:
-    """The usual drawing of a two-finger hand: line segments (5, 2, 3) in the world, metres.
+    """The usual drawing of a two-finger hand: line segments (4, 2, 3) in the world, metres.
 
-    Two fingers at the opening `width`, the bar that joins them, the wrist, and the tick between the pads at the TCP.
+    Two fingers at the opening `width`, the bar that joins them, and the wrist.
     """
     tip, bar = PANDA.tip_offset, PANDA.tip_offset - PANDA.finger_length
     half = width / 2
@@ -110,7 +143,6 @@ def hand_lines(T_world_grasp: Float[np.ndarray, "4 4"], width: float) -> Float64
             [[0, -half, bar], [0, -half, tip]],
             [[0, -half, bar], [0, half, bar]],
             [[0, 0, bar - 0.045], [0, 0, bar]],
-            [[0, -0.004, 0], [0, 0.004, 0]],
         ]
     )
     matrix = np.asarray(T_world_grasp, dtype=np.float64)
@@ -125,7 +157,9 @@ def cloud_picture(
     hand_colour: tuple[int, int, int],
     viewpoint: Float[np.ndarray, 3],
 ) -> Image.Image:
-    """The cloud and a hand, seen from the camera's side but turned so that the hand's plane is broad.
+    """The cloud over the table and a hand, seen from the camera's side but turned so that the hand's plane is broad.
+
+    What points hide of the hand is pale.
 
     Args:
         points_world: metres.
@@ -135,27 +169,28 @@ def cloud_picture(
         hand_colour: red, green, blue.
         viewpoint: the camera's position in the world, metres.
     """
-    camera = _cloud_view(np.asarray(T_world_grasp), np.asarray(viewpoint))
-    canvas = _splat(points_world, colours, camera)
+    T_world_view = _cloud_view(np.asarray(T_world_grasp), np.asarray(viewpoint))
+    lines = hand_lines(T_world_grasp, width)
+    view = _fitted(np.concatenate([points_world, lines.reshape(-1, 3)]), T_world_view)
+    canvas = _table(T_world_view, view)
+    depths = _splat(canvas, points_world, colours, T_world_view, view)
     image = Image.fromarray(canvas)
-    drawing = ImageDraw.Draw(image)
-    for segment in hand_lines(T_world_grasp, width):
-        pixels, depths = _project(segment, camera, _CLOUD_CAMERA)
-        if (depths > 0).all():
-            line = [tuple(pixel) for pixel in pixels.tolist()]
-            drawing.line(line, fill=(255, 255, 255), width=2 * _LINE_PX)
-            drawing.line(line, fill=hand_colour, width=_LINE_PX)
-            for x, y in line:
-                drawing.ellipse((x - 2, y - 2, x + 2, y + 2), fill=hand_colour)
+    _draw_hand(image, depths, lines, hand_colour, T_world_view, view)
     return image
 
 
+def picture(image: Image.Image | UInt8[np.ndarray, "height width 3"]) -> Image.Image:
+    """An image scaled to `PICTURE_SIZE`."""
+    whole = Image.fromarray(image) if isinstance(image, np.ndarray) else image
+    return whole.resize(PICTURE_SIZE, Image.Resampling.LANCZOS)
+
+
 def png(image: Image.Image | UInt8[np.ndarray, "height width 3"]) -> bytes:
-    """A picture, scaled to `PICTURE_SIZE`, as a small PNG of at most 128 colours."""
-    picture = Image.fromarray(image) if isinstance(image, np.ndarray) else image
-    small = picture.resize(PICTURE_SIZE, Image.Resampling.LANCZOS)
+    """A picture as a small PNG of at most 128 colours."""
     buffer = io.BytesIO()
-    small.quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(buffer, "PNG", optimize=True)
+    picture(image).quantize(128, method=Image.Quantize.FASTOCTREE, dither=Image.Dither.NONE).save(
+        buffer, "PNG", optimize=True
+    )
     return buffer.getvalue()
 
 
@@ -186,26 +221,93 @@ def _project(
     return np.stack([columns, rows], axis=1), depths
 
 
+def _fitted(points_world: Float64[np.ndarray, "points 3"], T_world_view: Pose) -> CameraIntrinsics:
+    """The camera that has all points on the canvas, as large as they go."""
+    width, height = _CANVAS_PX
+    pixels, _ = _project(points_world, T_world_view, CameraIntrinsics(width, height, 1.0, 1.0, 0.0, 0.0))
+    low, high = pixels.min(axis=0), pixels.max(axis=0)
+    room = (1 - 2 * _CLOUD_MARGIN) * np.array(_CANVAS_PX)
+    focal = float(min((room / np.maximum(high - low, 1e-6)).min(), _LONGEST_FOCAL_PX))
+    centre = np.array(_CANVAS_PX) / 2 - focal * (low + high) / 2
+    return CameraIntrinsics(width, height, focal, focal, float(centre[0]), float(centre[1]))
+
+
+def _table(T_world_view: Pose, view: CameraIntrinsics) -> UInt8[np.ndarray, "height width 3"]:
+    """A canvas with the workspace's floor and its grid of 5 cm."""
+    image = Image.new("RGB", _CANVAS_PX, _BACKGROUND)
+    drawing = ImageDraw.Draw(image)
+    low, high = float(WORKSPACE.minimum[0]), float(WORKSPACE.maximum[0])
+    corners = np.array([(x, y, TABLE_HEIGHT) for x, y in ((low, low), (high, low), (high, high), (low, high))])
+    drawing.polygon(_corners(corners, T_world_view, view), fill=_TABLE)
+    for at in np.linspace(low, high, round((high - low) / _GRID_STEP) + 1):
+        for ends in (((at, low), (at, high)), ((low, at), (high, at))):
+            line = np.array([(x, y, TABLE_HEIGHT) for x, y in ends])
+            drawing.line(_corners(line, T_world_view, view), fill=_GRID, width=2)
+    return np.array(image)
+
+
+def _corners(
+    points_world: Float64[np.ndarray, "points 3"], T_world_view: Pose, view: CameraIntrinsics
+) -> list[tuple[float, float]]:
+    pixels, _ = _project(points_world, T_world_view, view)
+    return [(x, y) for x, y in pixels.tolist()]
+
+
 def _splat(
-    points_world: Float32[np.ndarray, "points 3"], colours: UInt8[np.ndarray, "points 3"], camera: Pose
-) -> UInt8[np.ndarray, "height width 3"]:
-    """Points as small discs, nearer ones over farther ones, darker with depth."""
-    height, width = _CLOUD_CAMERA.height, _CLOUD_CAMERA.width
-    canvas = np.empty((height, width, 3), dtype=np.uint8)
-    canvas[:] = _BACKGROUND
+    canvas: UInt8[np.ndarray, "height width 3"],
+    points_world: Float32[np.ndarray, "points 3"],
+    colours: UInt8[np.ndarray, "points 3"],
+    T_world_view: Pose,
+    view: CameraIntrinsics,
+) -> Float64[np.ndarray, "height width"]:
+    """Draw points as small discs, nearer ones over farther ones, darker with depth; the depths of what is seen."""
+    nearest = np.full(canvas.shape[:2], np.inf)
     if not len(points_world):
-        return canvas
-    pixels, depths = _project(points_world, camera, _CLOUD_CAMERA)
+        return nearest
+    pixels, depths = _project(points_world, T_world_view, view)
     order = np.argsort(-depths, kind="stable")
     pixels, depths = np.floor(pixels[order] + 0.5).astype(np.int64), depths[order]
     near, far = depths.min(), max(depths.max(), depths.min() + 1e-6)
     shade = 1.0 - 0.35 * (depths - near) / (far - near)
     shaded = (colours[order] * shade[:, None]).astype(np.uint8)
     # Numpy keeps the last of several assignments to one pixel: the nearest, as the order is from far to near.
-    reach = range(-_POINT_RADIUS_PX, _POINT_RADIUS_PX + 1)
-    offsets = np.array([(x, y) for x in reach for y in reach if x * x + y * y <= _POINT_RADIUS_PX**2 + 1])
+    radius = max(2, round(_POINT_RADIUS * view.fx / _CLOUD_DISTANCE))
+    reach = range(-radius, radius + 1)
+    offsets = np.array([(x, y) for x in reach for y in reach if x * x + y * y <= radius**2 + 1])
     spots = (pixels[:, None] + offsets[None]).reshape(-1, 2)
-    colour = np.repeat(shaded, len(offsets), axis=0)
-    inside = (spots >= 0).all(axis=1) & (spots[:, 0] < width) & (spots[:, 1] < height)
-    canvas[spots[inside, 1], spots[inside, 0]] = colour[inside]
-    return canvas
+    inside = (spots >= 0).all(axis=1) & (spots[:, 0] < canvas.shape[1]) & (spots[:, 1] < canvas.shape[0])
+    columns, rows = spots[inside].T
+    canvas[rows, columns] = np.repeat(shaded, len(offsets), axis=0)[inside]
+    nearest[rows, columns] = np.repeat(depths, len(offsets))[inside]
+    return nearest
+
+
+def _draw_hand(
+    image: Image.Image,
+    nearest: Float64[np.ndarray, "height width"],
+    lines: Float64[np.ndarray, "lines 2 3"],
+    colour: tuple[int, int, int],
+    T_world_view: Pose,
+    view: CameraIntrinsics,
+) -> None:
+    seen: list[list[tuple[float, float]]] = []
+    hidden: list[list[tuple[float, float]]] = []
+    for start, end in lines:
+        points = start + np.linspace(0.0, 1.0, 100)[:, None] * (end - start)
+        pixels, depths = _project(points, T_world_view, view)
+        columns, rows = np.floor(pixels + 0.5).astype(np.int64).T
+        inside = (columns >= 0) & (columns < image.width) & (rows >= 0) & (rows < image.height)
+        behind = np.zeros(len(points), dtype=bool)
+        behind[inside] = depths[inside] > nearest[rows[inside], columns[inside]] + _HIDDEN_BEHIND
+        for run in np.split(np.arange(len(points)), np.flatnonzero(np.diff(behind)) + 1):
+            stroke = [(x, y) for x, y in pixels[run].tolist()]
+            (hidden if behind[run[0]] else seen).append(stroke)
+    drawing = ImageDraw.Draw(image, "RGBA")
+    for stroke in hidden:
+        drawing.line(stroke, fill=(*colour, _HIDDEN_ALPHA), width=_LINE_PX)
+    for reach, fill in ((_HALO_PX, (255, 255, 255)), (0, colour)):
+        for stroke in seen:
+            drawing.line(stroke, fill=fill, width=_LINE_PX + 2 * reach)
+            radius = _LINE_PX / 2 + reach
+            for x, y in (stroke[0], stroke[-1]):
+                drawing.ellipse((x - radius, y - radius, x + radius, y + radius), fill=fill)

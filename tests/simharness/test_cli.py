@@ -255,6 +255,7 @@ def test_only_watching_needs_the_viewer() -> None:
         (["--camera", "fisheye"], "invalid choice"),
         (["--noise-std", "-1"], "out of range"),
         (["--noise-std", "nan"], "out of range"),
+        (["--watch", "--watch-port", "70000"], "give 0 to 65535"),
         (["--seeds", "1", "1"], "named twice"),
         (["--seed", "0", "--seeds", "1"], "not allowed with"),
         (["--resume"], "--out"),

@@ -328,8 +328,8 @@ def test_points_beside_an_object_get_its_colour() -> None:
 
 def test_what_points_hide_of_the_hand_is_pale() -> None:
     # A wall before the hand, seen from the side of negative y.
-    x, z = np.meshgrid(np.linspace(0.05, 0.25, 300), np.linspace(0.05, 0.3, 300))
-    wall = np.stack([x.ravel(), np.full(x.size, 0.05), z.ravel()], axis=1).astype(np.float32)
+    x, z = np.meshgrid(np.linspace(-0.1, 0.4, 400), np.linspace(0.05, 0.3, 200))
+    wall = np.stack([x.ravel(), np.full(x.size, 0.15), z.ravel()], axis=1).astype(np.float32)
     grey = np.full((len(wall), 3), 100, dtype=np.uint8)
     pose = Pose.from_quaternion([1.0, 0.0, 0.0, 0.0], [0.15, 0.2, 0.08]).matrix
     picture = np.asarray(cloud_picture(wall, grey, pose, 0.08, (220, 38, 38), np.array([0.15, -0.4, 0.3])))
