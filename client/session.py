@@ -42,6 +42,9 @@ DEFAULT_TIMEOUT = 30.0
 MAX_TIMEOUT = 3600.0
 """The longest deadline that the service takes, seconds."""
 
+_DIRECT: Mapping[str, None] = dict.fromkeys(("all://127.0.0.1", "all://localhost", "all://[::1]"))
+"""httpx's patterns of what no proxy that the environment names could reach for us: this machine itself."""
+
 
 class _Plans:
     """What both clients know: where the service is, and which conversation each method holds with it."""
@@ -94,7 +97,8 @@ class GraspClient(_Plans):
     Raises:
         InvalidArgument: a URL that is not http or https, a timeout that is not positive, an impossible header.
 
-    Every method raises the errors drawn in `client.errors`.
+    Every method raises the errors drawn in `client.errors`. Proxies that the environment names (`HTTPS_PROXY`, ...) are
+    used, except for services on this machine.
     """
 
     def __init__(
@@ -107,7 +111,7 @@ class GraspClient(_Plans):
         transport: httpx.BaseTransport | None = None,
     ) -> None:
         super().__init__(base_url, timeout=timeout, retry=retry, headers=headers)
-        self._http = httpx.Client(transport=transport)
+        self._http = httpx.Client(transport=transport, mounts=_DIRECT)
 
     def grasps(
         self,
@@ -195,7 +199,7 @@ class AsyncGraspClient(_Plans):
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
         super().__init__(base_url, timeout=timeout, retry=retry, headers=headers)
-        self._http = httpx.AsyncClient(transport=transport)
+        self._http = httpx.AsyncClient(transport=transport, mounts=_DIRECT)
 
     async def grasps(
         self,

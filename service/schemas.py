@@ -12,10 +12,8 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field
 
 from tesnet.geometry import FrameConvention
-from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
+from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS
 from tesnet.result import Reason
-
-MAX_VIEWPOINTS = 64
 
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
@@ -55,13 +53,13 @@ class GraspOptions(RequestPart):
 
     viewpoint: Vector | Annotated[list[Vector], Field(min_length=1, max_length=MAX_VIEWPOINTS)] | None = Field(
         default=None,
-        description="Camera position [x, y, z] in the cloud frame, or a list of up to 64 of them for a fused cloud; "
-        "turns normals towards the camera. Default: the origin, and `warnings` says so.",
+        description=f"Camera position [x, y, z] in the cloud frame, or a list of up to {MAX_VIEWPOINTS} of them for a "
+        "fused cloud; turns normals towards the camera. Default: the origin, and `warnings` says so.",
     )
     up: Vector | None = Field(
         default=None,
         description="Direction [x, y, z] against gravity in the cloud frame, of any length. Default: none, so grasps "
-        "from below are not filtered, and `warnings` says so.",
+        "from below are not filtered, only those from behind what the camera sees, and `warnings` says so.",
     )
     workspace: Box | None = Field(
         default=None,
@@ -155,13 +153,17 @@ class ModelIdentity(ResponsePart):
 
 
 class RejectedOut(ResponsePart):
-    """Candidates dropped by each step, in the order of the steps."""
+    """Candidates dropped by each step; one that several would drop counts at the first of them only."""
 
     support: int = Field(description="The hand would come within 4 mm of the support plane.")
-    from_below: int = Field(description="The hand would come from below (needs `up`).")
+    from_below: int = Field(
+        description="The hand would come from below or, without `up`, from behind what the camera sees."
+    )
     approach: int = Field(description="The direction of travel is outside the `approach` cone.")
     target: int = Field(description="Not on the target.")
-    collision: int = Field(description="The hand would collide with observed points.")
+    collision: int = Field(
+        description="The hand would collide with observed points, or with the shadow behind them (`unseen`)."
+    )
     min_score: int = Field(description="Score below `min_score`.")
     duplicates: int = Field(description="Too near a better grasp (`min_separation`).")
 
@@ -183,9 +185,9 @@ class TimingsOut(ResponsePart):
     decode: float = Field(description="Body to checked point cloud.")
     queue: float = Field(description="Waiting for the predictor.")
     prepare: float = Field(description="Crop, voxel grid, outliers, normals, neighbours.")
-    candidates: float = Field(description="Candidate grasps and their geometric masks.")
+    candidates: float = Field(description="Candidate grasps, their geometric masks and the collision check.")
     network: float = Field(description="Encoding the cloud and scoring candidates.")
-    rank: float = Field(description="Collision check, filters, ranking.")
+    rank: float = Field(description="`min_score`, order, `min_separation`.")
     total: float = Field(description="From the last byte of the request to the grasps.")
 
 

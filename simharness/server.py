@@ -31,6 +31,8 @@ READY_WITHIN_S = 120.0
 STOPPED_WITHIN_S = 15.0
 _POLL_S = 0.1
 _PORT_TRIES = 3
+_PORT_REFUSED = "GRASP_PORT is"
+"""How the service begins its message when it cannot have the port."""
 _LOG_TAIL_LINES = 5
 _LOG_TAIL_WIDTH = 400
 _PR_SET_PDEATHSIG = 1
@@ -72,7 +74,7 @@ class LocalService:
                 self._stop()
                 raise
             # Another program may have taken the port between our look and the service's.
-            if not tries_left or "in use" not in self._tail():
+            if not tries_left or _PORT_REFUSED not in self._tail():
                 break
         code = self._process.poll() if self._process else None
         self._stop()

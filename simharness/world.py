@@ -187,15 +187,6 @@ class World:
         linear, _ = bullet.getBaseVelocity(body, physicsClientId=self._client)
         return float(np.hypot(np.hypot(linear[0], linear[1]), linear[2]))
 
-    def set_velocity(self, body: int, linear: Sequence[float], angular: Sequence[float] = _ORIGIN) -> None:
-        """Give a body a velocity (m/s, rad/s)."""
-        bullet.resetBaseVelocity(body, linear, angular, physicsClientId=self._client)
-
-    def bounds(self, body: int, link: int = BASE_LINK) -> tuple[NDArray[np.float64], NDArray[np.float64]]:
-        """Lower and upper corner (3,) of a link's axis-aligned bounding box in the world, metres, margins included."""
-        lower, upper = bullet.getAABB(body, link, physicsClientId=self._client)
-        return np.array(lower), np.array(upper)
-
     # Joints and constraints
 
     def joint(self, body: int, name: str) -> int:

@@ -13,6 +13,7 @@ from tesnet.errors import InvalidQuery
 MAX_GRASPS = 1000
 MAX_APPROACH_POINTS = 1024
 MAX_CANDIDATES = 20_000
+MAX_VIEWPOINTS = 64
 MAX_DIAGONAL = 20.0
 """Metres; a cloud whose central 90 % spans more was not given in metres."""
 MAX_DISTANCE = 1e9
@@ -139,8 +140,8 @@ class GraspQuery:
             array = _numbers("viewpoint", self.viewpoints)
             viewpoints = _vector("viewpoint", array[None] if array.ndim == 1 else array, (-1, 3))
             object.__setattr__(self, "viewpoints", viewpoints)
-            if not 1 <= len(viewpoints) <= 64:
-                raise InvalidQuery("viewpoint", f"has {len(viewpoints)} positions; give 1 to 64")
+            if not 1 <= len(viewpoints) <= MAX_VIEWPOINTS:
+                raise InvalidQuery("viewpoint", f"has {len(viewpoints)} positions; give 1 to {MAX_VIEWPOINTS}")
             farthest = float(np.abs(viewpoints).max())
             _in_range("viewpoint", farthest, 0, MAX_DISTANCE, " m from the origin")
         if self.up is not None:

@@ -55,6 +55,19 @@ def test_a_path_prefix_and_headers_are_kept(call: Call, server: ScriptedServer) 
     assert server.received[0].headers["authorization"] == "Bearer key"
 
 
+def test_a_service_on_this_machine_is_asked_past_the_environments_proxy(
+    call: Call, server: ScriptedServer, closed_url: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("HTTP_PROXY", "http_proxy", "ALL_PROXY", "all_proxy"):
+        monkeypatch.setenv(name, closed_url)
+    for name in ("NO_PROXY", "no_proxy"):
+        monkeypatch.delenv(name, raising=False)
+    server.script = [answering({"status": "ready"})]
+    assert call(server.url, "ready") is True
+    assert call(server.url.replace("127.0.0.1", "localhost"), "ready") is True
+    assert [received.target for received in server.received] == ["/health/ready"] * 2
+
+
 def test_the_model_says_what_is_loaded(call: Call, server: ScriptedServer) -> None:
     server.script = [answering(model_document())]
     model = call(server.url, "model")

@@ -5,6 +5,7 @@ import io
 import json
 import os
 import signal
+import socket
 import subprocess
 import sys
 import time
@@ -20,7 +21,7 @@ import pytest
 from simharness.__main__ import main
 from simharness.errors import RunBroken
 from simharness.records import TIMING_KEYS
-from simharness.server import LocalService
+from simharness.server import LocalService, free_port
 
 pytestmark = pytest.mark.sim
 
@@ -329,6 +330,32 @@ def test_the_service_ends_when_the_harness_is_killed(stub_command: tuple[str, ..
         return False
 
     wait_for(gone, "the service to end")
+
+
+def test_another_port_is_tried_when_one_was_taken_meanwhile(
+    stub_command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    with socket.socket() as taken:
+        taken.bind(("127.0.0.1", 0))
+        taken.listen()
+        ports = [taken.getsockname()[1], free_port()]
+        monkeypatch.setattr("simharness.server.free_port", functools.partial(ports.pop, 0))
+        # The service finds out whether the port is free before it loads anything; the stub serves where it is.
+        command = ("bash", "-c", f"{sys.executable} -c '{_LISTEN_AS_THE_SERVICE}' && exec {' '.join(stub_command)}")
+        with LocalService("tesnet", tmp_path / "log", command) as service:
+            assert httpx.get(service.url + "/model", trust_env=False).status_code == 200
+    assert ports == []
+
+
+_LISTEN_AS_THE_SERVICE = """
+import os, sys
+from service import __main__ as service
+from service.settings import InvalidSetting, load_settings
+try:
+    service._listen(load_settings(os.environ)).close()
+except InvalidSetting as error:
+    sys.exit(service._fail(str(error), 2))
+"""
 
 
 def test_the_service_gets_fixed_settings(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
