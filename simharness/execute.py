@@ -132,7 +132,7 @@ def attempt(world: World, hand: Hand, T_world_grasp: NDArray[np.float64], width:
         return _finish(world, hand, "approach", frozenset(), contact_at_start=False, contact_on_way=True)
     lift = _close_and_lift(world, hand, grasp, executor, full_retreat=True)
     kind = lift.kind(executor)
-    grasped: frozenset[int] = lift.lifted.touched if kind == "success" else frozenset()
+    grasped: frozenset[int] = lift.lifted.held(executor) if kind == "success" else frozenset()
     return _finish(world, hand, kind, grasped, contact_at_start=at_start, contact_on_way=on_way)
 
 

@@ -101,6 +101,8 @@ class LocalService:
 
     def _start(self, port: int) -> None:
         environment = {name: value for name, value in os.environ.items() if name != "GRASP_API_KEYS"}
+        # Sums on a GPU may differ in their last bits from run to run; who wants its speed says so.
+        environment.setdefault("GRASP_DEVICE", "cpu")
         environment |= {
             "GRASP_HOST": "127.0.0.1",
             "GRASP_PORT": str(port),

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import hashlib
+import importlib
 import json
 import pickle
 import sys
@@ -303,8 +304,9 @@ def shipped(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> Path:
     (folder / "__init__.py").touch()
     for name in ("tesnet", "gatv2"):
         weights.save(folder / f"{name}.safetensors", tensors(), HEADER)
+    importlib.import_module("weights")  # so that monkeypatch puts the project's own back
     monkeypatch.syspath_prepend(tmp_path)
-    monkeypatch.delitem(sys.modules, "weights", raising=False)
+    monkeypatch.delitem(sys.modules, "weights")
     return folder
 
 
