@@ -8,7 +8,6 @@ from __future__ import annotations
 
 import argparse
 import os
-import socket
 import subprocess
 import sys
 import time
@@ -20,17 +19,11 @@ from pathlib import Path
 from bench.scene import SUPPORT_HEIGHT, UP, WORKSPACE_MAXIMUM, WORKSPACE_MINIMUM, five_objects
 from bench.table import processor, table
 from client import GraspClient
+from simharness.server import free_port
 
 READY_WITHIN_S = 60.0
 STOPPED_WITHIN_S = 30.0
 PREDICTOR_STAGES = ("prepare", "candidates", "network", "rank")
-
-
-def free_port() -> int:
-    """A TCP port that was free a moment ago."""
-    with socket.socket() as probe:
-        probe.bind(("127.0.0.1", 0))
-        return int(probe.getsockname()[1])
 
 
 @contextmanager

@@ -27,10 +27,9 @@ from simharness.world import World
 from tesnet import candidates, cloud
 from tesnet.collision import in_collision
 from tesnet.geometry import PANDA
+from tesnet.predictor import APPROACH_DISTANCE
 from tesnet.query import GraspQuery
 from training.labels import OUTCOMES, LabelledView, LabelsError, save_scene, scene_files
-
-APPROACH_DISTANCE = 0.05
 
 
 @dataclass(frozen=True, slots=True)
