@@ -23,7 +23,7 @@ from tesnet.predictor import configuration_of
 from training import metrics
 from training.augment import augment
 from training.evaluate import measure, score_views
-from training.labels import LabelledView, LabelsError, load_views, scene_files
+from training.views import LabelledView, LabelsError, load_views, scene_files
 
 
 @dataclass(frozen=True, slots=True)

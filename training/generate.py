@@ -6,6 +6,7 @@ Each scene is one job and one file, so a run that is stopped goes on where it wa
 from __future__ import annotations
 
 import json
+import math
 import multiprocessing
 import os
 import time
@@ -16,20 +17,22 @@ from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from simharness.camera import Preset, observe
+from simharness.camera import Observation, Preset, observe
 from simharness.execute import label_strict, snapshot_of
 from simharness.hand import Hand
 from simharness.objects import ObjectModel, load_object_set
 from simharness.scene import PERCEPTION_BOX, TABLE_HEIGHT, describe, make_scene
 from simharness.world import World
-from tesnet import candidates, cloud
+from tesnet import candidates, cloud, networks
 from tesnet.collision import in_collision
 from tesnet.geometry import PANDA
+from tesnet.networks import Network
 from tesnet.predictor import APPROACH_DISTANCE
 from tesnet.query import GraspQuery
-from training.labels import OUTCOMES, LabelledView, LabelsError, save_scene, scene_files
+from training.views import OUTCOMES, LabelledView, LabelsError, pairs_of, save_scene, scene_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +46,10 @@ class GenerateConfig:
         seed: scene i of a seed is the same whatever else is asked for.
         views: camera views of each scene.
         labels_per_view: at most this many candidates of a view are tried.
-        colliding_share: the part of them drawn from candidates that collide with the observed cloud.
+        colliding_share: the part of them drawn from candidates that collide with the observed cloud; None draws from
+            all candidates alike.
+        mine: weights of a network; half of the candidates that do not collide are then drawn from the quarter that it
+            scores best, where its mistakes become failed attempts.
         camera: preset.
     """
 
@@ -53,7 +59,8 @@ class GenerateConfig:
     seed: int = 0
     views: int = 2
     labels_per_view: int = 320
-    colliding_share: float = 0.7
+    colliding_share: float | None = 0.7
+    mine: Path | None = None
     camera: Preset = "random"
 
 
@@ -126,68 +133,95 @@ def object_sets(config: GenerateConfig) -> list[tuple[ObjectModel, ...]]:
     return [load_object_set(name, config.scene, exclude=config.exclude) for name in config.objects.split(",")]
 
 
-_worker: tuple[GenerateConfig, Path, list[tuple[ObjectModel, ...]]]
+@dataclass(frozen=True, slots=True)
+class _Worker:
+    """What a worker process keeps between its scenes."""
+
+    config: GenerateConfig
+    out: Path
+    sets: Sequence[tuple[ObjectModel, ...]]
+    network: Network | None
+
+
+_worker: _Worker
 
 
 def _start_worker(config: GenerateConfig, out: Path) -> None:
     global _worker  # noqa: PLW0603  a pool's initializer has no other way to hand state to its jobs
     os.nice(10)
     torch.set_num_threads(1)
-    _worker = (config, out, object_sets(config))
+    _worker = _Worker(config, out, object_sets(config), None if config.mine is None else networks.load(config.mine)[0])
 
 
 def _make_scene_file(number: int) -> tuple[np.ndarray[Any, np.dtype[np.int64]], float]:
     """Labels scene `number` and writes it; counts of the outcomes, and the seconds it took."""
-    config, out, sets = _worker
     started = time.monotonic()
-    description, views = label_scene(config, sets, number)
+    description, views = label_scene(_worker.config, _worker.sets, number, _worker.network)
     counts = np.zeros(len(OUTCOMES), dtype=np.int64)
     for view in views:
         counts += np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES))
-    save_scene(out / f"scene_{number:07d}.npz", description, views, counts)
+    save_scene(_worker.out / f"scene_{number:07d}.npz", description, views, counts)
     return counts, time.monotonic() - started
 
 
 def label_scene(
-    config: GenerateConfig, sets: Sequence[tuple[ObjectModel, ...]], number: int
+    config: GenerateConfig, sets: Sequence[tuple[ObjectModel, ...]], number: int, network: Network | None = None
 ) -> tuple[dict[str, Any], list[LabelledView]]:
-    """Makes scene `number`, observes it from `config.views` cameras and tries candidates of each view."""
-    rng = np.random.default_rng([config.seed, number, 0 if config.scene == "packed" else 1])
+    """Makes scene `number`, observes it from `config.views` cameras and tries candidates of each view.
+
+    A view's camera and noise derive from the seed, the scene's number and its own, so that it can be rendered again.
+    """
+    rng = _rng(config, number)
     models = sets[int(rng.integers(len(sets)))]
     with World() as world:
         hand = Hand(world)
         # Fewer objects, too: a table that is being cleared holds fewer and fewer.
         scene = make_scene(world, config.scene, models, rng, num_objects=int(rng.choice([1, 2, 3, 4, 5, 5])))
-        description = describe(scene) | {"seed": config.seed, "number": number, "cameras": []}
+        description = describe(scene) | {"seed": config.seed, "number": number, "camera": config.camera, "cameras": []}
         views: list[LabelledView] = []
         if not scene.placed:
             return description, views
-        for _ in range(config.views):
+        for number_of_view in range(config.views):
+            rng = _rng(config, number, number_of_view)
             observation = observe(world, config.camera, rng)
             description["cameras"].append(observation.Ts_world_camera.tolist())
-            view = _label_view(world, hand, observation.points_world, observation.viewpoints, config, rng)
+            view = _label_view(world, hand, observation, config, rng, network)
             if view is not None:
                 views.append(view)
         return description, views
 
 
-def _label_view(
-    world: World, hand: Hand, points_world: Any, viewpoints: Any, config: GenerateConfig, rng: np.random.Generator
-) -> LabelledView | None:
-    query = GraspQuery(
-        points_world,
-        viewpoints=viewpoints,
+def _rng(config: GenerateConfig, *numbers: int) -> np.random.Generator:
+    return np.random.default_rng([config.seed, 0 if config.scene == "packed" else 1, *numbers])
+
+
+def observed_query(observation: Observation, seed: int = 0) -> GraspQuery:
+    """What the harness would ask about an observation."""
+    return GraspQuery(
+        observation.points_world,
+        viewpoints=observation.viewpoints,
         up=np.array([0.0, 0.0, 1.0]),
         workspace=PERCEPTION_BOX,
         support_height=TABLE_HEIGHT,
-        seed=int(rng.integers(2**31)),
+        seed=seed,
     )
+
+
+def _label_view(
+    world: World,
+    hand: Hand,
+    observation: Observation,
+    config: GenerateConfig,
+    rng: np.random.Generator,
+    network: Network | None,
+) -> LabelledView | None:
+    query = observed_query(observation, seed=int(rng.integers(2**31)))
     prepared = cloud.prepare(query, cloud.PreparationConfig(), torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
     free = ~in_collision(prepared, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
-    chosen = _choose(free.numpy(), config, rng)
+    chosen = _choose(prepared, found, free, config, rng, network)
     if len(chosen) == 0:
         return None
     which = torch.from_numpy(chosen)
@@ -197,18 +231,34 @@ def _label_view(
         kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), PANDA.max_width), snapshot)
     return LabelledView(
         cloud=prepared,
-        candidates=picked,
+        pairs=pairs_of(prepared, picked),
+        approach=picked.approach,
+        contact=picked.contact,
         outcomes=torch.tensor([OUTCOMES.index(kind) for kind in kinds], dtype=torch.uint8),
         collision_free=free[which],
         scene=config.scene,
     )
 
 
-def _choose(free: Any, config: GenerateConfig, rng: np.random.Generator) -> Any:
-    """Indices of the candidates to try: free ones, drawn at random, and some that collide with the observed cloud."""
-    clear, blocked = np.flatnonzero(free), np.flatnonzero(~free)
-    num_blocked = min(len(blocked), round(config.labels_per_view * config.colliding_share))
-    num_clear = min(len(clear), config.labels_per_view - num_blocked)
-    return np.sort(
-        np.concatenate([rng.choice(clear, num_clear, replace=False), rng.choice(blocked, num_blocked, replace=False)])
-    ).astype(np.int64)
+def _choose(
+    prepared: cloud.PreparedCloud,
+    found: candidates.Candidates,
+    free: torch.Tensor,
+    config: GenerateConfig,
+    rng: np.random.Generator,
+    network: Network | None,
+) -> NDArray[np.int64]:
+    """Indices of the candidates to try, in order: free ones and some that collide with the observed cloud."""
+    if config.colliding_share is None:
+        return np.sort(rng.permutation(len(found))[: config.labels_per_view])
+    clear, blocked = (np.flatnonzero(mask.numpy()) for mask in (free, ~free))
+    chosen_blocked = rng.permutation(blocked)[: round(config.labels_per_view * config.colliding_share)]
+    num_clear = config.labels_per_view - len(chosen_blocked)
+    mined = np.empty(0, dtype=np.int64)
+    if network is not None and len(clear):
+        with torch.inference_mode():
+            logits = network.score(network.encode(prepared), prepared, found.select(free))
+        best = clear[logits.argsort(descending=True)[: math.ceil(len(clear) / 4)].numpy()]
+        mined = rng.permutation(best)[: num_clear // 2]
+    others = rng.permutation(np.setdiff1d(clear, mined))[: num_clear - len(mined)]
+    return np.sort(np.concatenate([mined, others, chosen_blocked]))
