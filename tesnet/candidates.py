@@ -63,12 +63,10 @@ class Candidates:
         return Candidates(self.approach[which], self.contact[which], self.Ts_canonical_grasp[which])
 
 
-def generate(
-    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig
-) -> tuple[Candidates, dict[str, int]]:
-    """At most `max_candidates` candidates, and how many pairs each mask dropped (support, from_below, approach, target).
+def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -> tuple[Candidates, dict[str, int]]:
+    """At most `max_candidates` candidates, and how many pairs each mask dropped.
 
-    Approach points lie on the target, where there is one. While they yield fewer than half of `max_candidates`, as beside
+    Approach points lie on the target, if there is one. While they yield fewer than half of `max_candidates`, as beside
     flat objects, four times as many are tried.
     """
     allowed = torch.arange(len(cloud), device=cloud.points.device)

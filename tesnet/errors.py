@@ -43,11 +43,11 @@ class TooManyPoints(TesnetError):
     """A cloud has more points than may be.
 
     Args:
-        count: how many it claims to have.
+        count: how many it has or claims to have; words where they were not counted to the end.
         limit: how many may be.
     """
 
-    def __init__(self, count: int, limit: int) -> None:
+    def __init__(self, count: int | str, limit: int) -> None:
         super().__init__(f"The cloud has {count} points (limit {limit}); crop or downsample it.")
         self.count = count
         self.limit = limit

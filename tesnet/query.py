@@ -170,7 +170,9 @@ class GraspQuery:
             object.__setattr__(self, "target", _mask(self.target, len(self.points)))
         if not isinstance(self.gripper, Gripper):
             raise InvalidQuery("gripper", f"is of type {type(self.gripper).__name__}; give a Gripper")
-        _in_range("gripper", self.gripper.max_width, 0, PANDA.max_width, " m in max_width: no network knows a wider hand")
+        _in_range(
+            "gripper", self.gripper.max_width, 0, PANDA.max_width, " m in max_width: no network knows a wider hand"
+        )
         for name, kind in (("workspace", Box), ("approach", ApproachCone)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):

@@ -23,7 +23,7 @@ LEAST_CONTRAST = 2.0
 """Upright walls, and planes that are not across `up`, fill one slab like the next; a plane across `up` holds at least
 this many times the cells of the slab above it and of the slab below it."""
 MOST_BELOW = 0.2
-"""Nothing is seen through a support; under the top of a box are its sides. The limit is a share of the plane's cells."""
+"""Nothing is seen through a support; under the top of a box are its sides. A share of the plane's cells."""
 BELOW = 0.015
 FOOTPRINT_CELL = 0.02
 _REACH = 10.0
@@ -44,12 +44,12 @@ class SupportPlane:
 
 
 def settled(query: GraspQuery, device: torch.device) -> tuple[GraspQuery, str]:
-    """The query with the height of its dominant plane, or without a support where there is none; a note that says so."""
+    """The query with the height of its dominant plane, or without one if there is none; and a note for the caller."""
     plane = dominant_plane(query, device)
     if plane is None:
         note = "support_height auto: no plane across up was found, so no support is kept clear: give the height, or up"
         return replace(query, support_height=None), note
-    note = f"support_height auto: the plane at {plane.height:.4f} m along up, {plane.share:.0%} of the surface that is seen"
+    note = f"support_height auto: the plane at {plane.height:.4f} m along up, {plane.share:.0%} of what is seen"
     return replace(query, support_height=plane.height), note
 
 

@@ -1,4 +1,4 @@
-"""PCD (Point Cloud Library): ascii, binary and binary_compressed -> points. A compressed one needs the package `lzf`."""
+"""PCD (Point Cloud Library): ascii, binary and binary_compressed -> points. The last needs the package `lzf`."""
 
 from __future__ import annotations
 
@@ -92,11 +92,15 @@ def _parse(lines: list[list[str]]) -> _Header:
         raise UnreadableFile("The PCD header's FIELDS, SIZE, TYPE and COUNT differ in length; save the file again.")
     for kind, size in zip(kinds, sizes, strict=True):
         if size not in _SIZES.get(kind, ()):
-            raise UnreadableFile(f"The PCD header has a field of TYPE {kind[:10]!a} and SIZE {size}, which is no number.")
+            raise UnreadableFile(
+                f"The PCD header has a field of TYPE {kind[:10]!a} and SIZE {size}, which is no number."
+            )
     if "POINTS" in given:
         points = whole_number(" ".join(given["POINTS"]), "number of POINTS in the PCD header")
     else:
-        width, height = (whole_number(" ".join(_words(given, name)), f"{name} of the PCD") for name in ("WIDTH", "HEIGHT"))
+        width, height = (
+            whole_number(" ".join(_words(given, name)), f"{name} of the PCD") for name in ("WIDTH", "HEIGHT")
+        )
         points = width * height
     data = " ".join(given["DATA"])
     if data not in ("ascii", "binary", "binary_compressed"):

@@ -133,7 +133,7 @@ def _row_bytes(element: _Element) -> int:
     for name, kind in element.properties:
         if kind is None:
             raise UnreadableFile(
-                f"The PLY's element {element.name[:40]!a} has a list {name[:40]!a}, so that its rows have no one length; "
+                f"The PLY's element {element.name[:40]!a} has a list {name[:40]!a}, so its rows differ in length; "
                 "save the points alone, or before everything else."
             )
         size += int(kind[1:])

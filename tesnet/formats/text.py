@@ -14,7 +14,9 @@ _BLOCK = 1 << 17
 """Bytes decoded in one go: a few milliseconds, whatever the size of the file."""
 
 
-def read_rows(content: Content, start: int, skip: int, count: int, columns: Sequence[int], kind: str) -> NDArray[np.float64]:
+def read_rows(
+    content: Content, start: int, skip: int, count: int, columns: Sequence[int], kind: str
+) -> NDArray[np.float64]:
     """The wanted columns (count, len(columns)) of `count` lines of numbers; lines without words are no lines.
 
     Args:
