@@ -8,8 +8,8 @@ from typing import Any
 
 import numpy as np
 import plyfile
-import pypcd4
 import pytest
+from pypcd4.pypcd4 import Encoding, PointCloud
 
 from client.cloud_file import CloudFileError, read_cloud
 
@@ -120,7 +120,7 @@ def test_a_missing_file_and_an_unknown_suffix(tmp_path: Path) -> None:
 def test_a_compressed_pcd_names_the_package_that_it_needs(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
     path = tmp_path / "cloud.pcd"
     points = np.ones((100, 3), np.float32)  # random ones do not compress, and pypcd4 saves them as they are
-    pypcd4.PointCloud.from_xyz_points(points).save(path, pypcd4.Encoding.BINARY_COMPRESSED)
+    PointCloud.from_xyz_points(points).save(path, Encoding.BINARY_COMPRESSED)
     np.testing.assert_array_equal(read_cloud(path), points)
     monkeypatch.setitem(sys.modules, "lzf", None)
     with pytest.raises(CloudFileError, match="pip install python-neo-lzf"):

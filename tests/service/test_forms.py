@@ -10,14 +10,15 @@ from typing import Any
 
 import httpx
 import numpy as np
-import pypcd4
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from numpy.typing import NDArray
 from PIL import Image
+from pypcd4.pypcd4 import Encoding, PointCloud
 
 from service.payloads import Payload, decoder_for
+from tests.depth_scene import SIZE, box_on_table
 from tests.service.test_bad_input import problem_of
 from tests.service.test_contract import npy, post_octets, steady
 from tests.tesnet.test_formats import ply
@@ -54,17 +55,6 @@ def bomb(side: int) -> bytes:
     return SIGNATURE + grey_head(side, side) + chunk(b"IDAT", data) + chunk(b"IEND", b"")
 
 
-def scene() -> tuple[NDArray[np.uint16], NDArray[np.uint8]]:
-    """Depth (mm) of a 4 x 6 x 12 cm box on a table as the camera above sees its top; and a mask of the top."""
-    depth = np.full((120, 160), 500, np.uint16)
-    top = (slice(40, 88), slice(60, 100))
-    depth[top] = 380
-    depth[:5] = 0
-    mask = np.zeros(depth.shape, np.uint8)
-    mask[top] = 7
-    return depth, mask
-
-
 def post(http: httpx.Client, files: dict[str, bytes], options: Any = None, query: str = "") -> httpx.Response:
     parts: dict[str, Any] = {name: (f"{name}.bin", content) for name, content in files.items()}
     if options is not None:
@@ -73,9 +63,9 @@ def post(http: httpx.Client, files: dict[str, bytes], options: Any = None, query
     return http.post(f"/grasps{query}", files=parts)
 
 
-def pcd(points: Cloud, encoding: pypcd4.Encoding) -> bytes:
+def pcd(points: Cloud, encoding: Encoding) -> bytes:
     file = io.BytesIO()
-    pypcd4.PointCloud.from_xyz_points(points).save(file, encoding)
+    PointCloud.from_xyz_points(points).save(file, encoding)
     return file.getvalue()
 
 
@@ -86,8 +76,8 @@ def test_every_cloud_file_gives_the_grasps_of_its_points(http: httpx.Client, clo
         "npy": npy(cloud),
         "ply, little-endian": ply(cloud, "<"),
         "ply, big-endian": ply(cloud, ">", before=True),
-        "pcd, binary": pcd(cloud, pypcd4.Encoding.BINARY),
-        "pcd, compressed": pcd(cloud, pypcd4.Encoding.BINARY_COMPRESSED),
+        "pcd, binary": pcd(cloud, Encoding.BINARY),
+        "pcd, compressed": pcd(cloud, Encoding.BINARY_COMPRESSED),
     }
     for name, content in files.items():
         assert steady(post(http, {"cloud": content}, OPTIONS).json()) == expected, name
@@ -135,20 +125,22 @@ def test_indices_that_are_none_are_a_422(http: httpx.Client, cloud: Cloud, indic
 
 
 def test_a_depth_image_gives_grasps_on_what_its_mask_marks(http: httpx.Client) -> None:
-    depth, mask = scene()
-    options = {"intrinsics": INTRINSICS, "T_cloud_camera": T_CLOUD_CAMERA, "up": [0, 0, 1], "max_candidates": 300}
-    everything = post(http, {"depth": png(depth)}, options).json()
-    assert everything["counts"]["points"] == np.count_nonzero(depth)
+    view = box_on_table()
+    options = {**view.camera, "up": [0, 0, 1], "support_height": "auto", "max_candidates": 300}
+    everything = post(http, {"depth": png(view.counts)}, options).json()
+    assert everything["counts"]["points"] == np.count_nonzero(view.counts)
     assert not [note for note in everything["warnings"] if "viewpoint" in note]
-    marked = post(http, {"depth": png(depth), "mask": png(mask)}, {**options, "support_height": "auto"}).json()
-    assert any("support_height auto: the plane at 0.0000 m" in note for note in marked["warnings"])
+    assert any("support_height auto: the plane at 0.000" in note for note in everything["warnings"])
+    files = {"depth": png(view.counts), "mask": png(np.where(view.mask, 7, 0).astype(np.uint8))}
+    marked = post(http, files, options).json()
+    assert marked["grasps"]
     for grasp in marked["grasps"]:
-        assert grasp["approach_point"][2] == pytest.approx(0.12, abs=0.002)
-        assert grasp["contact_point"][2] == pytest.approx(0.12, abs=0.002)
-    pixels = {"target": {"indices": np.flatnonzero(mask).tolist()}}
-    assert steady(post(http, {"depth": png(depth)}, {**options, "support_height": "auto", **pixels}).json()) == steady(
-        marked
-    )
+        for point in (grasp["approach_point"], grasp["contact_point"]):
+            assert (np.abs(np.array(point) - [0, 0, SIZE[2] / 2]) <= SIZE / 2 + 0.003).all()
+    pixels = {"target": {"indices": np.flatnonzero(view.mask).tolist()}}
+    assert steady(post(http, {"depth": png(view.counts)}, {**options, **pixels}).json()) == steady(marked)
+    black = {"depth": png(view.counts), "mask": png(np.zeros(view.mask.shape, np.uint8))}
+    assert post(http, black, options).json()["reason"] == "no_candidates"
 
 
 def test_depth_is_scaled_and_moved_as_the_camera_says() -> None:
@@ -185,7 +177,8 @@ def test_parts_come_out_as_they_went_in_whatever_looks_like_a_boundary(pieces: l
     assert payload.points.tobytes() == points.tobytes()
 
 
-DEPTH = png(scene()[0])
+VIEW = box_on_table()
+DEPTH, MASK = png(VIEW.counts), png(VIEW.mask.astype(np.uint8))
 CAMERA = {"intrinsics": INTRINSICS}
 
 BAD_FORMS: dict[str, tuple[dict[str, bytes], Any, int, str]] = {
@@ -231,7 +224,7 @@ BAD_FORMS: dict[str, tuple[dict[str, bytes], Any, int, str]] = {
     "depth scale of nothing": ({"depth": DEPTH}, {**CAMERA, "depth_scale": 0}, 422, "depth_scale"),
     "depth of metres per count": ({"depth": DEPTH}, {**CAMERA, "depth_scale": 1}, 422, "metres"),
     "depth that is no PNG": ({"depth": b"\xff\xd8\xff\xe0 a JPEG, for example"}, CAMERA, 400, "PNG"),
-    "depth of 8 bits": ({"depth": png(scene()[1])}, CAMERA, 422, "8 bits"),
+    "depth of 8 bits": ({"depth": MASK}, CAMERA, 422, "8 bits"),
     "depth in colours": ({"depth": png(np.zeros((4, 4, 3), np.uint8))}, CAMERA, 422, "coloured"),
     "depth cut off": ({"depth": DEPTH[:-40]}, CAMERA, 400, "damaged"),
     "depth of no pixels": ({"depth": SIGNATURE + grey_head(0, 5) + bytes(20)}, CAMERA, 400, "PNG"),
@@ -256,11 +249,11 @@ BAD_FORMS: dict[str, tuple[dict[str, bytes], Any, int, str]] = {
     ),
     "a bomb": ({"depth": bomb(3000)}, CAMERA, 413, "3000 x 3000 pixels (limit 4000000"),
     "too many points in a depth image": ({"depth": png(np.ones((1001, 1000), np.uint16))}, CAMERA, 413, "1001000"),
-    "mask of another size": ({"depth": DEPTH, "mask": png(scene()[1][1:])}, CAMERA, 422, "160 x 119"),
+    "mask of another size": ({"depth": DEPTH, "mask": png(VIEW.mask[1:].astype(np.uint8))}, CAMERA, 422, "200 x 159"),
     "mask of 16 bits": ({"depth": DEPTH, "mask": DEPTH}, CAMERA, 422, "16 bits"),
     "mask that is none": ({"depth": DEPTH, "mask": b"mask"}, CAMERA, 400, "mask"),
     "mask and target": (
-        {"depth": DEPTH, "mask": png(scene()[1])},
+        {"depth": DEPTH, "mask": MASK},
         {**CAMERA, "target": {"indices": [1]}},
         422,
         "give one",
@@ -302,7 +295,7 @@ def test_what_is_no_form_is_refused(
 def test_a_pcd_without_some_pixels_counts_its_rows_for_targets(http: httpx.Client, cloud: Cloud) -> None:
     rows = np.insert(cloud, np.arange(0, len(cloud), 3), np.nan, axis=0)
     on_box = np.flatnonzero(rows[:, 2] > 0.001).tolist()
-    content = pcd(rows, pypcd4.Encoding.BINARY)
+    content = pcd(rows, Encoding.BINARY)
     answer = post(http, {"cloud": content}, {**OPTIONS, "target": {"indices": on_box}}).json()
     expected = post(
         http, {"cloud": npy(cloud)}, {**OPTIONS, "target": {"indices": np.flatnonzero(cloud[:, 2] > 0.001).tolist()}}

@@ -10,12 +10,12 @@ from typing import Any
 
 import numpy as np
 import plyfile
-import pypcd4
 import pytest
 from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 from numpy.typing import NDArray
+from pypcd4.pypcd4 import Encoding, PointCloud
 
 from tesnet.errors import TooManyPoints, UnreadableFile
 from tesnet.formats import is_pcd, is_ply, read_pcd, read_ply, seen, text
@@ -42,12 +42,12 @@ def ply(points: Array, layout: str, before: bool = False) -> bytes:
     return file.getvalue()
 
 
-def pcd(points: Array, encoding: pypcd4.Encoding) -> bytes:
+def pcd(points: Array, encoding: Encoding) -> bytes:
     """The points among other fields; written by pypcd4."""
     columns = [points[:, 0], np.zeros(len(points), np.uint8), points[:, 1], points[:, 2].astype(np.float64)]
     types = (np.float32, np.uint8, np.float32, np.float64)
     file = io.BytesIO()
-    pypcd4.PointCloud.from_points(columns, ("x", "ring", "y", "z"), types).save(file, encoding)
+    PointCloud.from_points(columns, ("x", "ring", "y", "z"), types).save(file, encoding)
     return file.getvalue()
 
 
@@ -60,8 +60,8 @@ def test_ply_of_every_layout(points: Array, layout: str, before: bool) -> None:
 
 
 @settings(max_examples=40)
-@given(clouds, st.sampled_from([pypcd4.Encoding.ASCII, pypcd4.Encoding.BINARY, pypcd4.Encoding.BINARY_COMPRESSED]))
-def test_pcd_of_every_encoding(points: Array, encoding: pypcd4.Encoding) -> None:
+@given(clouds, st.sampled_from([Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED]))
+def test_pcd_of_every_encoding(points: Array, encoding: Encoding) -> None:
     content = pcd(points, encoding)
     assert is_pcd(content)
     np.testing.assert_allclose(read_pcd(content, len(points)), points, rtol=1e-5, atol=1e-9)
@@ -198,7 +198,7 @@ def test_more_points_than_the_limit_are_refused(layout: str) -> None:
     content = ply(np.zeros((11, 3), np.float32), layout)
     with pytest.raises(TooManyPoints, match=r"11 points \(limit 10\)"):
         read_ply(content, 10)
-    for encoding in (pypcd4.Encoding.ASCII, pypcd4.Encoding.BINARY, pypcd4.Encoding.BINARY_COMPRESSED):
+    for encoding in (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED):
         with pytest.raises(TooManyPoints, match=r"11 points \(limit 10\)"):
             read_pcd(pcd(np.zeros((11, 3), np.float32), encoding), 10)
 
@@ -207,7 +207,7 @@ def test_a_compressed_pcd_expands_to_so_many_bytes_a_point_and_no_more() -> None
     columns = np.zeros((1000, 3 + 40), np.float32)
     file = io.BytesIO()
     names = ("x", "y", "z", *(f"f{number}" for number in range(40)))
-    pypcd4.PointCloud.from_points(columns, names, [np.float32] * 43).save(file, pypcd4.Encoding.BINARY_COMPRESSED)
+    PointCloud.from_points(columns, names, [np.float32] * 43).save(file, Encoding.BINARY_COMPRESSED)
     assert len(read_pcd(file.getvalue(), 10_000)) == 1000
     with pytest.raises(UnreadableFile, match=r"172000 bytes \(limit 64000\)"):
         read_pcd(file.getvalue(), 1000)
@@ -216,7 +216,7 @@ def test_a_compressed_pcd_expands_to_so_many_bytes_a_point_and_no_more() -> None
 @settings(max_examples=40)
 @given(st.data())
 def test_a_damaged_file_raises_nothing_else(data: st.DataObject) -> None:
-    encodings = (pypcd4.Encoding.ASCII, pypcd4.Encoding.BINARY, pypcd4.Encoding.BINARY_COMPRESSED)
+    encodings = (Encoding.ASCII, Encoding.BINARY, Encoding.BINARY_COMPRESSED)
     points = np.arange(30, dtype=np.float32).reshape(10, 3)
     files = [(read_ply, ply(points, layout, True)) for layout in ("text", "<")]
     files += [(read_pcd, pcd(points, encoding)) for encoding in encodings]
