@@ -14,13 +14,12 @@ import anyio.to_thread
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.answers import encode_answer
+from service.answers import encoder_for
 from service.batching import Answer, Job, PredictionWorker
 from service.errors import (
     ClientGone,
     DeadlineExceeded,
     Invalid,
-    NotAcceptable,
     NotReady,
     UnknownContentType,
     shortened,
@@ -28,7 +27,15 @@ from service.errors import (
 from service.intake import Intake
 from service.metrics import Metrics
 from service.middleware import RequestRecord
-from service.payloads import DECODERS, JSON, Decoder, RawOptions, build_query, merged, parse_options, parse_query_string
+from service.payloads import (
+    Decoder,
+    RawOptions,
+    build_query,
+    decoder_for,
+    merged,
+    parse_options,
+    parse_query_string,
+)
 from service.schemas import GraspOptions
 from service.settings import Settings
 from tesnet.query import GraspQuery
@@ -111,7 +118,7 @@ class GraspEndpoint:
 
     async def _answer(self, request: Request, record: RequestRecord) -> Response:
         decode = decoder_of(request)
-        check_accept(request.headers.get("accept", "*/*"))
+        encoder = encoder_for(request.headers.getlist("accept"))
         url_options = parse_query_string(request.scope["query_string"])
         parse_options(url_options)  # refuse a bad one before the body is read
         async with self._intake.body(request) as body:
@@ -134,17 +141,17 @@ class GraspEndpoint:
             reason=result.reason,
             timings_ms={stage: round(milliseconds, 3) for stage, milliseconds in timings.items()},
         )
-        encode = partial(encode_answer, result, options, self._worker.model, timings, record.request_id)
+        encode = partial(encoder.encode, result, options, self._worker.model, timings, record.request_id)
         body_out = encode() if len(result.grasps) <= SMALL_ANSWER else await self._in_thread(encode)
-        return Response(body_out, media_type=JSON)
+        return Response(body_out, media_type=encoder.content_type, headers={"Vary": "Accept"})
 
     def _decode(self, decode: Decoder, body: bytearray, url_options: RawOptions) -> tuple[GraspQuery, GraspOptions]:
         payload = decode(body, self._settings.max_points)
-        options = parse_options(merged(url_options, payload.options))
+        options = parse_options(merged(url_options, payload.options), self._settings.max_points)
         loaded = self._worker.model.name
         if options.model != loaded:
             raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {loaded}")
-        return build_query(payload.points, options), options
+        return build_query(payload, options), options
 
     async def _predict(self, request: Request, query: GraspQuery) -> Answer:
         """Queue the query and wait for its answer, or for the client to hang up."""
@@ -195,29 +202,14 @@ def decoder_of(request: Request) -> Decoder:
 
     Raises:
         UnknownContentType: there is none.
+        Undecodable: a form without a boundary.
     """
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
         raise UnknownContentType(
             f"Content-Encoding {shortened(encoding)} is not supported; send the body uncompressed."
         )
-    given = request.headers.get("content-type", "")
-    decoder = DECODERS.get(given.partition(";")[0].strip().lower())
-    if decoder is None:
-        what = f"Content-Type {shortened(given)} is not supported" if given else "Content-Type is missing"
-        raise UnknownContentType(f"{what}; send one of {', '.join(DECODERS)}.")
-    return decoder
-
-
-def check_accept(accept: str) -> None:
-    """Refuse a client that takes nothing but arrays.
-
-    Raises:
-        NotAcceptable: JSON is the only format there is.
-    """
-    kinds = {part.partition(";")[0].strip().lower() for part in accept.split(",")}
-    if "application/x-npz" in kinds and not kinds & {JSON, "application/*", "*/*"}:
-        raise NotAcceptable(f"application/x-npz is not supported yet; accept {JSON}.")
+    return decoder_for(request.headers.get("content-type", ""))
 
 
 async def _hung_up(request: Request) -> None:
