@@ -28,6 +28,9 @@ DESCRIPTION = """Point cloud in, ranked SE(3) grasps out. Lengths are metres; po
 points. In the default `panda` convention a grasp's origin is the TCP, +z is the direction of travel and +y the closing
 direction."""
 
+STOP_SECONDS = 2.0
+"""For a prediction that still runs when the application ends; its thread is left behind after that."""
+
 
 def create_app(
     settings: Settings,
@@ -44,15 +47,17 @@ def create_app(
         on_failure: called there with the exception when the predictor cannot be made.
     """
     metrics = Metrics()
-    worker = PredictionWorker(predictor_factory, settings.queue_size, metrics.batch, on_ready, on_failure)
+    worker = PredictionWorker(
+        predictor_factory, settings.queue_size, settings.max_batch, metrics.batch, on_ready, on_failure
+    )
     endpoint = GraspEndpoint(settings, worker, metrics)
-    metrics.watch(queue_depth=lambda: worker.depth, is_ready=lambda: endpoint.ready)
+    metrics.watch(queue_depth=lambda: worker.depth, active=lambda: endpoint.active, is_ready=lambda: endpoint.ready)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         worker.start()
         yield
-        await anyio.to_thread.run_sync(worker.stop)
+        await anyio.to_thread.run_sync(endpoint.close, STOP_SECONDS)
 
     app = FastAPI(
         title="TES-Net grasp service",
@@ -71,7 +76,7 @@ def create_app(
         "/grasps", tags=["grasps"], summary="Grasps for a point cloud", response_class=Response, include_in_schema=True
     )
     async def grasps(request: Request) -> Response:
-        return await endpoint.answer(request)
+        return await endpoint.answer(request, endpoint.reader)
 
     @app.get("/health/live", tags=["health"], summary="Does the process work?", responses=problems(NotReady))
     async def live() -> schemas.Health:

@@ -3,8 +3,8 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
-import re
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
@@ -33,7 +33,21 @@ class InvalidSetting(Exception):
 def default_threads() -> int:
     """Cores that this process may use, at most `MAX_THREADS`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MAX_THREADS)
+    return max(1, int(min(cores, MAX_THREADS, cpu_quota())))
+
+
+def cpu_quota(groups: Path = Path("/sys/fs/cgroup")) -> float:
+    """Cores' worth of time that the container may use, infinite without a limit.
+
+    More threads than that are all stopped for the rest of every tenth of a second once its time is used up.
+    """
+    for paths in (["cpu.max"], ["cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"]):
+        try:
+            quota, period = " ".join((groups / path).read_text(encoding="ascii") for path in paths).split()
+        except (OSError, ValueError):  # another version of control groups, or none
+            continue
+        return math.inf if quota in ("max", "-1") else int(quota) / int(period)
+    return math.inf
 
 
 class Settings(BaseModel):
@@ -56,7 +70,7 @@ class Settings(BaseModel):
         default_factory=default_threads,
         ge=1,
         le=1024,
-        description=f"CPU threads of the predictor. Default: the cores, at most {MAX_THREADS}.",
+        description=f"CPU threads of the predictor. Default: the cores it may use, at most {MAX_THREADS}.",
     )
     max_points: int = Field(
         default=1_000_000, ge=1, le=100_000_000, description="Points in a request, 1 to 100,000,000."
@@ -67,14 +81,20 @@ class Settings(BaseModel):
     queue_size: int = Field(
         default=32, ge=1, le=10_000, description="Requests that may wait for the predictor, 1 to 10,000."
     )
-    max_batch: Literal[1] = Field(
-        default=1, description="Clouds predicted together; this version predicts one at a time: 1."
+    max_batch: int = Field(
+        default=1,
+        ge=1,
+        le=64,
+        description="Waiting requests predicted together, 1 to 64; more than 1 does not pay on a CPU.",
     )
     request_timeout: float = Field(
         default=30.0, gt=0, le=3600, description="Seconds to answer a request without X-Request-Timeout, at most 3600."
     )
     drain_timeout: float = Field(
-        default=30.0, ge=0, le=3600, description="Seconds to finish accepted requests after SIGTERM, 0 to 3600."
+        default=25.0,
+        ge=0,
+        le=3600,
+        description="Seconds to finish accepted requests after SIGTERM, 0 to 3600; the process ends at most 5 s later.",
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least level of a log line: debug, info, warning or error."
@@ -84,11 +104,6 @@ class Settings(BaseModel):
     @classmethod
     def _lower_case(cls, value: object) -> object:
         return value.strip().lower() if isinstance(value, str) else value
-
-    @field_validator("max_batch", mode="before")
-    @classmethod
-    def _whole_number(cls, value: object) -> object:
-        return int(value) if isinstance(value, str) and re.fullmatch(r"\d{1,6}", value) else value
 
     @property
     def max_body_bytes(self) -> int:

@@ -7,6 +7,7 @@ encoded once; what a candidate adds is a gather, a small shared MLP over the poi
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -110,14 +111,24 @@ class TesNet(nn.Module):
 
     def encode(self, cloud: PreparedCloud) -> CloudFeatures:
         """Features of every point and of the whole cloud; computed once, shared by all candidates."""
-        x = torch.relu(self.lift(point_inputs(cloud)))
-        edges = edge_inputs(cloud)
+        return self.encode_batch([cloud])[0]
+
+    def encode_batch(self, clouds: Sequence[PreparedCloud]) -> list[CloudFeatures]:
+        """The features of each of several clouds, in one pass over the stacked graphs of all of them.
+
+        They equal those of `encode` up to the rounding of float32, which depends on the size of a matrix product.
+        """
+        sizes = [len(cloud) for cloud in clouds]
+        before = [sum(sizes[:i]) for i in range(len(sizes))]
+        x = torch.relu(self.lift(torch.cat([point_inputs(cloud) for cloud in clouds])))
+        edges = torch.cat([edge_inputs(cloud) for cloud in clouds])
+        neighbours = torch.cat([cloud.neighbours + start for cloud, start in zip(clouds, before, strict=True)])
         depths = [x]
         for stage in self.stages:
-            x = stage(x, cloud.neighbours, edges)
+            x = stage(x, neighbours, edges)
             depths.append(x)
-        points = self.merge(torch.cat(depths, dim=1))
-        return CloudFeatures(points, self.context(points.amax(dim=0)))
+        stacked = self.merge(torch.cat(depths, dim=1))
+        return [CloudFeatures(points, self.context(points.amax(dim=0))) for points in stacked.split(sizes)]
 
     def score(
         self, features: CloudFeatures, cloud: PreparedCloud, candidates: Candidates, mirror: Tensor | None = None
