@@ -217,7 +217,9 @@ def _parser() -> argparse.ArgumentParser:
     lines = []
     for name, field in variables().items():
         described = Settings.model_fields[field]
-        default = "" if described.default_factory or described.default is None else f" Default: {described.default}."
+        default = (
+            "" if described.default_factory or described.default in (None, ()) else f" Default: {described.default}."
+        )
         lines.append(
             textwrap.fill(
                 f"{described.description}{default}", 110, initial_indent=f"  {name:<22} ", subsequent_indent=" " * 25

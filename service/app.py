@@ -10,8 +10,10 @@ import msgspec
 from fastapi import FastAPI, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
 
 from service import schemas
+from service.access import AccessMiddleware
 from service.batching import PredictionWorker, PredictorFactory
 from service.errors import NotReady, ServiceError, problem_response
 from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
@@ -68,6 +70,23 @@ def create_app(
         redirect_slashes=False,
     )
     app.state.endpoint = endpoint
+    if settings.api_keys:
+        app.add_middleware(AccessMiddleware, keys=[key.get_secret_value() for key in settings.api_keys])
+    if settings.cors_origins:  # outside: a browser asks for permission without a key
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=[
+                "Accept",
+                "Authorization",
+                "Content-Type",
+                "X-API-Key",
+                "X-Request-ID",
+                "X-Request-Timeout",
+            ],
+            expose_headers=["Retry-After", "X-Request-ID"],
+        )
     app.add_middleware(RequestMiddleware, metrics=metrics)
     for kind in (ServiceError, InvalidQuery, HTTPException):
         app.add_exception_handler(kind, _answer_problem)
@@ -136,4 +155,4 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
 
 
 async def _answer_problem(request: Request, error: Exception) -> Response:
-    return problem_response(error, request.state.record.request_id)
+    return problem_response(error, request.scope)

@@ -213,6 +213,9 @@ class Problem(ResponsePart):
     detail: str = Field(description="What was found, what is allowed, and what to do.")
     request_id: str = Field(description="X-Request-ID of this request.")
     field: str | None = Field(default=None, description="The option or header at fault, where there is one.")
+    error: str | None = Field(
+        default=None, description="`detail` again, on routes of the Open Inference Protocol, whose clients read this."
+    )
 
 
 class Health(ResponsePart):

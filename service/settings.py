@@ -5,12 +5,13 @@ from __future__ import annotations
 import difflib
 import math
 import os
+import re
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
 
 PREFIX = "GRASP_"
 MAX_THREADS = 8
@@ -96,6 +97,16 @@ class Settings(BaseModel):
         le=3600,
         description="Seconds to finish accepted requests after SIGTERM, 0 to 3600; the process ends at most 5 s later.",
     )
+    api_keys: tuple[SecretStr, ...] = Field(
+        default=(),
+        description="Keys, separated by commas, one of which a request must bring as `Authorization: Bearer KEY` or "
+        "`X-API-Key: KEY`; printable ASCII without spaces. Default: none, everybody is answered.",
+    )
+    cors_origins: tuple[str, ...] = Field(
+        default=(),
+        description="Origins of web pages, separated by commas, whose scripts may ask (https://robot.example), or *. "
+        "Default: none.",
+    )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least level of a log line: debug, info, warning or error."
     )
@@ -105,15 +116,29 @@ class Settings(BaseModel):
     def _lower_case(cls, value: object) -> object:
         return value.strip().lower() if isinstance(value, str) else value
 
+    @field_validator("api_keys", "cors_origins", mode="before")
+    @classmethod
+    def _split(cls, value: object) -> object:
+        return [part.strip() for part in value.split(",")] if isinstance(value, str) else value
+
+    @field_validator("api_keys")
+    @classmethod
+    def _printable(cls, keys: tuple[SecretStr, ...]) -> tuple[SecretStr, ...]:
+        if not all(re.fullmatch(r"[!-~]+", key.get_secret_value()) for key in keys):
+            raise ValueError("not printable")
+        return keys
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        if not all(re.fullmatch(r"\*|https?://[^/\s]+", origin) for origin in origins):
+            raise ValueError("no origin")
+        return origins
+
     @property
     def max_body_bytes(self) -> int:
         """Bytes in a request's body."""
         return int(self.max_body_mb * 2**20)
-
-
-REFUSED = {
-    "GRASP_API_KEYS": "this version knows no API keys and would answer everybody; unset it, and put a proxy in front"
-}
 
 
 def load_settings(environment: Mapping[str, str]) -> Settings:
@@ -122,9 +147,6 @@ def load_settings(environment: Mapping[str, str]) -> Settings:
     Raises:
         InvalidSetting: names the variable, its value and the remedy.
     """
-    for variable, why in REFUSED.items():
-        if environment.get(variable):
-            raise InvalidSetting(variable, f"is set, but {why}")
     values = {
         field: environment[variable]
         for variable, field in variables().items()
@@ -142,7 +164,8 @@ def load_settings(environment: Mapping[str, str]) -> Settings:
                 " Kubernetes sets this variable for a Service named `grasp`: give the Service another name, or set "
                 "enableServiceLinks: false."
             )
-        raise InvalidSetting(f"{PREFIX}{field.upper()}", f"is {values[field]!r}; expected: {remedy}{hint}") from None
+        value = "not usable" if field == "api_keys" else repr(values[field])  # a secret stays out of logs
+        raise InvalidSetting(f"{PREFIX}{field.upper()}", f"is {value}; expected: {remedy}{hint}") from None
 
 
 def variables() -> dict[str, str]:
@@ -153,7 +176,7 @@ def variables() -> dict[str, str]:
 def unknown_variables(environment: Mapping[str, str]) -> dict[str, str | None]:
     """`GRASP_*` variables that mean nothing, each with the closest known name."""
     known = variables()
-    unknown = [name for name in environment if name.startswith(PREFIX) and name not in known and name not in REFUSED]
+    unknown = [name for name in environment if name.startswith(PREFIX) and name not in known]
     return {name: next(iter(difflib.get_close_matches(name, known, 1)), None) for name in sorted(unknown)}
 
 

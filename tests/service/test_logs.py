@@ -63,7 +63,8 @@ def test_a_reader_that_stopped_costs_lines_which_are_counted_when_it_goes_on(
             received += os.read(reading, 2**20)
         whole, _, _ = received.rpartition(b"\n")
         lines = [json.loads(line) for line in whole.splitlines()]
-        return sum(line.get("lines", 1) for line in lines) == 2000
+        total: int = sum(line.get("lines", 1) for line in lines)
+        return total == 2000
 
     eventually(all_accounted_for)
     handler.close()

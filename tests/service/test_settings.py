@@ -48,6 +48,7 @@ def test_every_value_is_text_and_an_empty_one_means_the_default() -> None:
         ("GRASP_MODELS", "tesnet,gpd", "tesnet"),
         ("GRASP_REQUEST_TIMEOUT", "0", "3600"),
         ("GRASP_DRAIN_TIMEOUT", "inf", "3600"),
+        ("GRASP_CORS_ORIGINS", "robot.example", "https://"),
         ("GRASP_LOG_LEVEL", "loud", "debug"),
     ],
 )
@@ -73,10 +74,16 @@ def test_threads_follow_the_quota_of_the_container(tmp_path: Path) -> None:
     assert cpu_quota(tmp_path) == math.inf
 
 
-def test_api_keys_are_refused_rather_than_ignored() -> None:
-    with pytest.raises(InvalidSetting, match="GRASP_API_KEYS"):
-        load_settings({"GRASP_API_KEYS": "secret"})
+def test_keys_and_origins_are_lists_and_keys_are_never_shown() -> None:
+    settings = load_settings({"GRASP_API_KEYS": "first, second", "GRASP_CORS_ORIGINS": "https://robot.example,*"})
+    assert [key.get_secret_value() for key in settings.api_keys] == ["first", "second"]
+    assert "first" not in repr(settings)
+    assert settings.cors_origins == ("https://robot.example", "*")
     assert load_settings({"GRASP_API_KEYS": ""}) == load_settings({})
+    for wrong in ("hush,", "hush hush", "h\u00fcsh"):
+        with pytest.raises(InvalidSetting, match="GRASP_API_KEYS") as refused:
+            load_settings({"GRASP_API_KEYS": wrong})
+        assert wrong not in str(refused.value)
 
 
 def test_unknown_variables_come_with_the_closest_known_name() -> None:
