@@ -25,7 +25,7 @@ from client.errors import (
     UnsupportedMediaType,
 )
 from client.reply import Counts, Grasp, GraspReply, Limits, ModelIdentity, ModelReply
-from client.request import GraspOptions
+from client.request import GraspOptions, GripperSize, Intrinsics
 from client.retry import RetryPolicy
 from client.session import AsyncGraspClient, GraspClient
 
@@ -39,6 +39,8 @@ __all__ = [
     "GraspClientError",
     "GraspOptions",
     "GraspReply",
+    "GripperSize",
+    "Intrinsics",
     "InvalidArgument",
     "InvalidRequest",
     "Limits",

@@ -11,15 +11,15 @@ import os
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import Any
+from typing import Any, cast
 
 import numpy as np
 from numpy.typing import NDArray
 
-from client.cloud_file import READERS, CloudFileError, decode_cloud, read_cloud, read_npy
+from client.cloud_file import READERS, CloudFileError, decode_cloud, read_bytes, read_cloud, read_npy
 from client.errors import GraspClientError, InvalidArgument, Overloaded, ProblemError
 from client.reply import GraspReply
-from client.request import GraspOptions
+from client.request import GraspOptions, GripperSize
 from client.session import DEFAULT_TIMEOUT, GraspClient
 from tesnet.geometry import FRAME_CONVENTIONS
 
@@ -32,12 +32,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     parser = _parser()
     chosen = parser.parse_args(arguments)
+    if chosen.intrinsics is None and (chosen.mask is not None or chosen.camera_pose is not None):
+        parser.error("--mask and --camera-pose belong to a depth image; give its --intrinsics as well")
     if chosen.support_height is not None and chosen.up is None:
         parser.error("--support-height is measured along `up`; give --up as well, for instance --up 0 0 1")
     try:
-        points = _points(chosen.cloud)
         with GraspClient(chosen.url, timeout=chosen.timeout) as client:
-            reply = client.grasps(points, request_id=chosen.request_id, **_options(chosen))
+            reply = _ask(client, chosen)
     except (CloudFileError, GraspClientError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
         return _exit_code(error)
@@ -53,6 +54,22 @@ def table(reply: GraspReply) -> str:
         rows.append((str(rank), f"{grasp.score:.3f}", *(f"{number:.4f}" for number in numbers)))
     widths = [max(len(cell) for cell in column) for column in zip(*rows, strict=True)]
     return "\n".join("  ".join(cell.rjust(width) for cell, width in zip(row, widths, strict=True)) for row in rows)
+
+
+def _ask(client: GraspClient, chosen: argparse.Namespace) -> GraspReply:
+    options = _options(chosen)
+    if chosen.intrinsics is None:
+        return client.grasps(_points(chosen.cloud), request_id=chosen.request_id, **options)
+    fx, fy, cx, cy = chosen.intrinsics
+    return client.grasps_from_depth(
+        read_bytes(Path(chosen.cloud)),
+        intrinsics={"fx": fx, "fy": fy, "cx": cx, "cy": cy},
+        mask=None if chosen.mask is None else read_bytes(chosen.mask),
+        T_cloud_camera=None if chosen.camera_pose is None else np.reshape(chosen.camera_pose, (4, 4)),
+        depth_scale=chosen.depth_scale,
+        request_id=chosen.request_id,
+        **options,
+    )
 
 
 def _points(cloud: str) -> NDArray[Any]:
@@ -88,6 +105,10 @@ def _options(chosen: argparse.Namespace) -> GraspOptions:
         options["approach"] = {"direction": chosen.approach[:3], "max_angle_deg": chosen.approach[3]}
     if chosen.min_separation is not None:
         options["min_separation"] = {"translation": chosen.min_separation[0], "rotation_deg": chosen.min_separation[1]}
+    if chosen.target_box is not None:
+        options["target"] = {"box": {"min": chosen.target_box[:3], "max": chosen.target_box[3:]}}
+    if chosen.gripper is not None:
+        options["gripper"] = cast("GripperSize", dict(chosen.gripper))
     for name in _PLAIN_OPTIONS:
         value = getattr(chosen, name)
         if value is not None:
@@ -118,6 +139,17 @@ def _number(text: str) -> float:
     return value
 
 
+def _height(text: str) -> float | str:
+    return text if text == "auto" else _number(text)
+
+
+def _length(text: str) -> tuple[str, float]:
+    name, separator, value = text.partition("=")
+    if not separator:
+        raise argparse.ArgumentTypeError(f"{text} is not NAME=METRES")
+    return name, _number(value)
+
+
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m client",
@@ -126,7 +158,10 @@ def _parser() -> argparse.ArgumentParser:
         "Options left out get the service's defaults.",
     )
     add = parser.add_argument
-    add("cloud", help=f"file ({', '.join(READERS)}), or - for a .npy array on stdin")
+    add(
+        "cloud",
+        help=f"file ({', '.join(READERS)}; with --intrinsics a depth image, 16-bit .png), or - for .npy on stdin",
+    )
     add(
         "--url",
         default=os.environ.get("GRASP_URL") or DEFAULT_URL,
@@ -135,6 +170,12 @@ def _parser() -> argparse.ArgumentParser:
     add("--json", action="store_true", help="print the service's JSON instead of a table")
     add("--timeout", type=_number, default=DEFAULT_TIMEOUT, metavar="S", help="seconds in all (default: %(default)g)")
     add("--request-id", metavar="ID", help="names the request in the service's log")
+    image = parser.add_argument_group("of a depth image")
+    add = image.add_argument
+    add("--intrinsics", type=_number, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="its camera, in pixels")
+    add("--mask", type=Path, metavar="FILE", help="8-bit .png of the same size; only what it marks is grasped")
+    add("--camera-pose", type=_number, nargs=16, metavar="M", help="T_cloud_camera, row by row (default: identity)")
+    add("--depth-scale", type=_number, default=0.001, metavar="M", help="metres per count (default: %(default)g)")
     wire = parser.add_argument_group("options of the request")
     add = wire.add_argument
     vector = ("X", "Y", "Z")
@@ -148,7 +189,16 @@ def _parser() -> argparse.ArgumentParser:
         help="camera position; repeat it for a fused cloud",
     )
     add("--up", type=_number, nargs=3, metavar=vector, help="direction against gravity")
-    add("--support-height", type=_number, metavar="H", help="height of the support plane along --up")
+    add(
+        "--support-height", type=_height, metavar="H", help="height of the support plane along --up, or auto to find it"
+    )
+    add(
+        "--target-box",
+        type=_number,
+        nargs=6,
+        metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
+        help="box; only what lies in it is grasped",
+    )
     add(
         "--workspace",
         type=_number,
@@ -173,6 +223,13 @@ def _parser() -> argparse.ArgumentParser:
     )
     add("--num-approach-points", type=int, metavar="N", help="search effort")
     add("--max-candidates", type=int, metavar="N", help="search effort")
+    add(
+        "--gripper",
+        type=_length,
+        nargs="+",
+        metavar="NAME=M",
+        help="another hand than the Panda's: max_width=0.06 finger_depth=0.04 ...",
+    )
     add("--unseen", choices=("free", "occupied"), help="the shadow behind observed points, for collisions")
     add("--pregrasp-distance", type=_number, metavar="M", help="how far behind the grasp the pregrasp lies")
     add("--frame-convention", choices=FRAME_CONVENTIONS, help="axes and origin of the printed poses")

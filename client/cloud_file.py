@@ -1,11 +1,10 @@
 """A cloud file -> points (N, 3), for the command line. Knows no service.
 
-.npy and text need numpy only; .ply and .pcd need the extra `files`, loaded when such a file is read.
+A compressed .pcd needs the extra `files`; everything else numpy only.
 """
 
 from __future__ import annotations
 
-import importlib
 import io
 from collections.abc import Callable, Mapping
 from pathlib import Path
@@ -14,6 +13,9 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tesnet.errors import TesnetError
+from tesnet.formats import read_pcd, read_ply, seen
 
 Points = NDArray[Any]
 
@@ -41,11 +43,19 @@ def read_cloud(path: Path) -> Points:
     reader = READERS.get(path.suffix.lower())
     if reader is None:
         raise CloudFileError(str(path), f"ends in {path.suffix or 'nothing'!r}; valid: {', '.join(READERS)}")
+    return decode_cloud(read_bytes(path), reader, str(path))
+
+
+def read_bytes(path: Path) -> bytes:
+    """A file's content.
+
+    Raises:
+        CloudFileError: it cannot be read.
+    """
     try:
-        content = path.read_bytes()
+        return path.read_bytes()
     except OSError as error:
         raise CloudFileError(str(path), f"cannot be read: {error.strerror or error}") from error
-    return decode_cloud(content, reader, str(path))
 
 
 def decode_cloud(content: bytes, reader: Callable[[bytes], Points], name: str) -> Points:
@@ -62,7 +72,7 @@ def decode_cloud(content: bytes, reader: Callable[[bytes], Points], name: str) -
         if error.name not in PACKAGES:
             raise
         raise CloudFileError(
-            name, f"needs the package {error.name}, which is not installed; pip install {error.name}"
+            name, f"is compressed and needs a package that is not installed; pip install {PACKAGES[error.name]}"
         ) from error
     except _DAMAGED as error:
         raise CloudFileError(
@@ -84,41 +94,18 @@ def read_text(content: bytes) -> Points:
     return np.loadtxt(io.StringIO(text), dtype=np.float64, comments=("#", "//"), usecols=(0, 1, 2), ndmin=2)
 
 
-def read_ply(content: bytes) -> Points:
-    """Points of the element `vertex` of a PLY file, ascii or binary of either byte order."""
-    plyfile = importlib.import_module("plyfile")
-    try:
-        vertex = plyfile.PlyData.read(io.BytesIO(content))["vertex"]
-    except plyfile.PlyParseError as error:
-        raise ValueError(str(error)) from error
-    except KeyError:
-        raise ValueError("has no element `vertex`") from None
-    missing = [name for name in "xyz" if name not in vertex]
-    if missing:
-        raise ValueError(f"its element `vertex` has no property {', '.join(missing)}")
-    return np.stack([np.asarray(vertex[name]) for name in "xyz"], axis=1)
+def read_seen_pcd(content: bytes) -> Points:
+    """Points of a PCD file, without the rows of pixels that have no depth."""
+    points = read_pcd(content)
+    return np.asarray(points[seen(points)])
 
 
-def read_pcd(content: bytes) -> Points:
-    """Points of a PCD file (ascii, binary or binary_compressed), without those that the camera did not see.
-
-    An organised cloud marks a pixel without depth by NaN in all three coordinates; those rows are no points.
-    """
-    pypcd4 = importlib.import_module("pypcd4")
-    cloud = pypcd4.PointCloud.from_fileobj(io.BytesIO(content))
-    missing = [name for name in "xyz" if name not in cloud.fields]
-    if missing:
-        raise ValueError(f"has no field {', '.join(missing)}")
-    points = np.asarray(cloud.numpy(("x", "y", "z")))
-    return np.asarray(points[~np.isnan(points).all(axis=1)])
-
-
-PACKAGES = frozenset({"plyfile", "pypcd4"})
-"""The extra `files`."""
+PACKAGES = {"lzf": "python-neo-lzf"}
+"""The extra `files`: what is imported, and what is installed."""
 
 READERS: Mapping[str, Callable[[bytes], Points]] = MappingProxyType(
-    {".npy": read_npy, ".ply": read_ply, ".pcd": read_pcd, ".xyz": read_text, ".txt": read_text}
+    {".npy": read_npy, ".ply": read_ply, ".pcd": read_seen_pcd, ".xyz": read_text, ".txt": read_text}
 )
 
-_DAMAGED = (ValueError, KeyError, IndexError, EOFError, RuntimeError, TypeError, MemoryError)
-"""What the readers raise on a damaged file; they have no error class in common."""
+_DAMAGED = (TesnetError, ValueError, TypeError, EOFError, MemoryError)
+"""What the readers, numpy among them, raise on a damaged file."""

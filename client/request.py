@@ -1,10 +1,12 @@
 """A caller's arguments -> one HTTP request, as pure functions. Knows the wire, but no HTTP library and no connection.
 
 Points travel as little-endian float32 triples; the options stand in the query string, each value as URL-encoded JSON.
+Depth images, and points with more options than fit into a URL, travel in a form.
 """
 
 from __future__ import annotations
 
+import io
 import json
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
@@ -16,9 +18,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from client.errors import InvalidArgument
+from client.form import File, encode_form
+from client.images import depth_counts, mask_levels, png
+from tesnet.geometry import CameraIntrinsics, Pose
 
 if TYPE_CHECKING:
     from tesnet.geometry import FrameConvention
+
+LONGEST_QUERY = 4000
+"""Characters of a query string; servers and proxies on the way refuse longer ones, some from 8,000 on."""
 
 Vector: TypeAlias = Sequence[float] | NDArray[Any]
 """x, y, z in the frame of the points."""
@@ -38,6 +46,47 @@ class ApproachCone(TypedDict):
     max_angle_deg: float
 
 
+class TargetBox(TypedDict):
+    """Grasp what lies in a box: approach and contact point are in it."""
+
+    box: Box
+
+
+class TargetPoints(TypedDict):
+    """Grasp these points: their row numbers in the cloud, or pixel numbers in a depth image, row by row from 0."""
+
+    indices: Sequence[int] | NDArray[Any]
+
+
+class GripperSize(TypedDict, total=False):
+    """A two-finger parallel hand, metres; what is left out is the Panda hand's. See `service.schemas.GripperSize`.
+
+    A part whose size is given is straight, unless its narrower end is given as well.
+    """
+
+    max_width: float
+    finger_depth: float
+    finger_thickness: float
+    finger_tip_thickness: float
+    finger_taper: float
+    finger_breadth: float
+    finger_tip_breadth: float
+    palm_depth: float
+    palm_length: float
+    palm_breadth: float
+    palm_front_breadth: float
+    palm_taper: float
+
+
+class Intrinsics(TypedDict):
+    """A pinhole camera without distortion, pixels."""
+
+    fx: float
+    fy: float
+    cx: float
+    cy: float
+
+
 class Separation(TypedDict, total=False):
     """Grasps nearer than both to a better one are dropped."""
 
@@ -55,13 +104,17 @@ class GraspOptions(TypedDict, total=False):
             a warning says so.
         up: direction against gravity. Without it grasps from below are not filtered, and a warning says so.
         workspace: `{"min": ..., "max": ...}`; points outside are ignored.
-        support_height: height of the support plane along `up` (needs `up`).
+        support_height: height of the support plane along `up` (needs `up`), or `"auto"` to find it: a warning then says
+            where.
+        target: `{"box": {"min": ..., "max": ...}}` or `{"indices": [...]}`: candidates come from it alone, the other
+            points still count for collision.
         approach: `{"direction": ..., "max_angle_deg": ...}`.
         max_grasps: how many to return (default 10).
         min_score: threshold (default 0).
         min_separation: `{"translation": 0.01, "rotation_deg": 15}`.
         num_approach_points: search effort (default 32).
         max_candidates: search effort (default 2000).
+        gripper: `{"max_width": 0.06, ...}`, at most 0.08 m wide (default: the Panda hand).
         unseen: whether the shadow behind observed points is `"free"` (default) or `"occupied"` for collisions.
         pregrasp_distance: how far behind the grasp `pregrasp` lies (default 0.05).
         frame_convention: `"panda"` (default), `"graspnet"` or `"contact_graspnet"`.
@@ -72,13 +125,15 @@ class GraspOptions(TypedDict, total=False):
     viewpoint: Vector | Sequence[Vector]
     up: Vector
     workspace: Box
-    support_height: float
+    support_height: float | Literal["auto"]
+    target: TargetBox | TargetPoints
     approach: ApproachCone
     max_grasps: int
     min_score: float
     min_separation: Separation
     num_approach_points: int
     max_candidates: int
+    gripper: GripperSize
     unseen: Literal["free", "occupied"]
     pregrasp_distance: float
     frame_convention: FrameConvention
@@ -112,12 +167,81 @@ def points_request(points: ArrayLike, options: Mapping[str, Any], request_id: st
     """
     cloud = checked_points(points)
     values = _options(options)
-    texts = {name: json.dumps(value, separators=(",", ":")) for name, value in values.items()}
+    texts = {name: _json(value) for name, value in values.items()}
     query = urlencode(texts, quote_via=quote)
+    if len(query) > LONGEST_QUERY:
+        return _form_request([File("cloud", "cloud.npy", _npy(cloud))], values, request_id)
     headers = {"Content-Type": "application/octet-stream", **_headers(request_id)}
     return Request(
         "POST", f"/grasps?{query}" if query else "/grasps", cloud.astype("<f4", copy=False).tobytes(), headers
     )
+
+
+def depth_request(
+    depth: ArrayLike | bytes,
+    intrinsics: Intrinsics | CameraIntrinsics,
+    options: Mapping[str, Any],
+    *,
+    mask: ArrayLike | bytes | None = None,
+    T_cloud_camera: Pose | ArrayLike | None = None,
+    depth_scale: float = 0.001,
+    request_id: str | None = None,
+) -> Request:
+    """The request for grasps of a depth image; see `GraspClient.grasps_from_depth`.
+
+    Raises:
+        InvalidArgument: an image or a camera that cannot be sent, or an option that JSON cannot express.
+        TypeError: an option of another name than those of `GraspOptions`.
+    """
+    camera: dict[str, Any] = {"intrinsics": _intrinsics(intrinsics), "depth_scale": depth_scale}
+    if T_cloud_camera is not None:
+        camera["T_cloud_camera"] = _plain("T_cloud_camera", _matrix(T_cloud_camera))
+    if isinstance(depth, bytes):
+        files = [File("depth", "depth.png", depth)]
+        shape = None
+    else:
+        counts = depth_counts(depth, depth_scale)
+        files = [File("depth", "depth.png", png(counts))]
+        shape = counts.shape
+    if isinstance(mask, bytes):
+        files.append(File("mask", "mask.png", mask))
+    elif mask is not None:
+        files.append(File("mask", "mask.png", png(mask_levels(mask, shape))))
+    return _form_request(files, {**_options(options), **camera}, request_id)
+
+
+def _form_request(files: Sequence[File], options: Mapping[str, Any], request_id: str | None) -> Request:
+    content_type, content = encode_form([*files, File("options", None, _json(options).encode(), "application/json")])
+    return Request("POST", "/grasps", content, {"Content-Type": content_type, **_headers(request_id)})
+
+
+def _json(value: Any) -> str:
+    return json.dumps(value, separators=(",", ":"))
+
+
+def _npy(cloud: NDArray[np.float32]) -> bytes:
+    file = io.BytesIO()
+    np.save(file, cloud, allow_pickle=False)
+    return file.getvalue()
+
+
+def _intrinsics(given: Intrinsics | CameraIntrinsics) -> dict[str, float]:
+    names = tuple(Intrinsics.__annotations__)
+    if isinstance(given, CameraIntrinsics):
+        return {name: float(getattr(given, name)) for name in names}
+    if set(given) != set(names):
+        raise InvalidArgument("intrinsics", f"must have exactly {', '.join(names)}, in pixels")
+    plain: dict[str, float] = _plain("intrinsics", given)
+    return plain
+
+
+def _matrix(pose: Pose | ArrayLike) -> NDArray[np.float64]:
+    if isinstance(pose, Pose):
+        return pose.matrix
+    try:
+        return Pose.from_matrix(pose).matrix
+    except ValueError as error:
+        raise InvalidArgument("T_cloud_camera", str(error)) from None
 
 
 def checked_points(points: ArrayLike) -> NDArray[np.float32]:

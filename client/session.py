@@ -29,11 +29,13 @@ from client.conversation import (
 )
 from client.errors import InvalidArgument
 from client.reply import Answer, GraspReply, ModelReply, grasp_reply, model_reply
-from client.request import GraspOptions, Request, header_value, points_request
+from client.request import GraspOptions, Intrinsics, Request, depth_request, header_value, points_request
 from client.retry import RetryPolicy
 
 if TYPE_CHECKING:
     from typing_extensions import Self, Unpack
+
+    from tesnet.geometry import CameraIntrinsics, Pose
 
 T = TypeVar("T")
 
@@ -69,6 +71,18 @@ class _Plans:
         self, points: ArrayLike, options: Mapping[str, Any], request_id: str | None, timeout: float | None
     ) -> Conversation[GraspReply]:
         return self._ask(points_request(points, options, request_id or uuid.uuid4().hex), grasp_reply, timeout)
+
+    def _grasps_from_depth(
+        self,
+        depth: ArrayLike | bytes,
+        intrinsics: Intrinsics | CameraIntrinsics,
+        options: Mapping[str, Any],
+        image: Mapping[str, Any],
+        request_id: str | None,
+        timeout: float | None,
+    ) -> Conversation[GraspReply]:
+        request = depth_request(depth, intrinsics, options, request_id=request_id or uuid.uuid4().hex, **image)
+        return self._ask(request, grasp_reply, timeout)
 
     def _model(self, timeout: float | None) -> Conversation[ModelReply]:
         return self._ask(Request("GET", "/model", headers={"Accept": "application/json"}), model_reply, timeout)
@@ -130,6 +144,35 @@ class GraspClient(_Plans):
             options: see `GraspOptions`; those absent or None get the service's defaults.
         """
         return self._perform(self._grasps(points, options, request_id, timeout))
+
+    def grasps_from_depth(
+        self,
+        depth: ArrayLike | bytes,
+        *,
+        intrinsics: Intrinsics | CameraIntrinsics,
+        mask: ArrayLike | bytes | None = None,
+        T_cloud_camera: Pose | ArrayLike | None = None,
+        depth_scale: float = 0.001,
+        request_id: str | None = None,
+        timeout: float | None = None,
+        **options: Unpack[GraspOptions],
+    ) -> GraspReply:
+        """Ranked grasps on what a depth image shows, best first.
+
+        Args:
+            depth: (height, width): whole numbers are counts of `depth_scale` metres, others are metres, rounded to it;
+                0, NaN and infinities are no depth. Or the bytes of a 16-bit grey PNG.
+            intrinsics: the camera, in pixels.
+            mask: (height, width), not zero on what is to be grasped; or the bytes of an 8-bit grey PNG.
+            T_cloud_camera: camera pose, 4 x 4; camera axes are +x right, +y down, +z forward. Without it the grasps are
+                in the frame of the camera.
+            depth_scale: metres per count.
+            request_id: names the request in the service's log; made up where absent.
+            timeout: seconds in all, instead of the client's own.
+            options: see `GraspOptions`; the default viewpoint is the camera's.
+        """
+        image = {"mask": mask, "T_cloud_camera": T_cloud_camera, "depth_scale": depth_scale}
+        return self._perform(self._grasps_from_depth(depth, intrinsics, options, image, request_id, timeout))
 
     def model(self, *, timeout: float | None = None) -> ModelReply:
         """The networks that the service has loaded, the gripper, the frames and the limits."""
@@ -211,6 +254,22 @@ class AsyncGraspClient(_Plans):
     ) -> GraspReply:
         """As `GraspClient.grasps`."""
         return await self._perform(self._grasps(points, options, request_id, timeout))
+
+    async def grasps_from_depth(
+        self,
+        depth: ArrayLike | bytes,
+        *,
+        intrinsics: Intrinsics | CameraIntrinsics,
+        mask: ArrayLike | bytes | None = None,
+        T_cloud_camera: Pose | ArrayLike | None = None,
+        depth_scale: float = 0.001,
+        request_id: str | None = None,
+        timeout: float | None = None,
+        **options: Unpack[GraspOptions],
+    ) -> GraspReply:
+        """As `GraspClient.grasps_from_depth`."""
+        image = {"mask": mask, "T_cloud_camera": T_cloud_camera, "depth_scale": depth_scale}
+        return await self._perform(self._grasps_from_depth(depth, intrinsics, options, image, request_id, timeout))
 
     async def model(self, *, timeout: float | None = None) -> ModelReply:
         """As `GraspClient.model`."""

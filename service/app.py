@@ -20,9 +20,9 @@ from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
 from service.metrics import Metrics
 from service.middleware import RequestMiddleware
 from service.openapi import document_grasps, problems
-from service.payloads import DECODERS
+from service.payloads import CONTENT_TYPES
 from service.settings import Settings, service_version
-from tesnet.errors import InvalidQuery
+from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
 from tesnet.geometry import FRAME_CONVENTIONS, HAND_TO_TCP, PANDA
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
 
@@ -88,7 +88,7 @@ def create_app(
             expose_headers=["Retry-After", "X-Request-ID"],
         )
     app.add_middleware(RequestMiddleware, metrics=metrics)
-    for kind in (ServiceError, InvalidQuery, HTTPException):
+    for kind in (ServiceError, InvalidQuery, TooManyPoints, UnreadableFile, HTTPException):
         app.add_exception_handler(kind, _answer_problem)
 
     @app.post(
@@ -140,7 +140,7 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
             hand_to_tcp=HAND_TO_TCP,
         ),
         frame_conventions=list(FRAME_CONVENTIONS),
-        content_types=list(DECODERS),
+        content_types=list(CONTENT_TYPES),
         limits=schemas.LimitsOut(
             max_points=settings.max_points,
             max_body_bytes=settings.max_body_bytes,

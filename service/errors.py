@@ -15,7 +15,9 @@
     +-- DeadlineExceeded     the client's deadline passed
     +-- ClientGone           nobody is left to answer
 
-`tesnet.errors.InvalidQuery` has its row too. A detail states the value, the limit and the remedy; it never holds the
+`InvalidQuery`, `UnreadableFile` and `TooManyPoints` of `tesnet.errors` have their rows too.
+
+A detail states the value, the limit and the remedy; it never holds the
 cloud.
 """
 
@@ -31,7 +33,7 @@ from starlette.responses import Response
 from starlette.types import Scope
 
 from service.schemas import Problem
-from tesnet.errors import InvalidQuery
+from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
 
 PROBLEM_JSON = "application/problem+json"
 INFERENCE_PROTOCOL = "/v2"
@@ -113,33 +115,36 @@ class Row:
     when: str
 
 
+_UNDECODABLE = Row(
+    400,
+    "undecodable-body",
+    "The body cannot be decoded",
+    "Empty or truncated body, broken JSON, form, .npy, PLY, PCD or PNG",
+)
+_TOO_LARGE = Row(
+    413, "too-large", "The request is too large", "More bytes, points or pixels than the configured limits"
+)
+_INVALID = Row(
+    422, "invalid-request", "A value cannot be used", "NaN, wrong shape, not metres, an option unknown or out of range"
+)
+
 PROBLEMS: Mapping[type[Exception], Row] = {
-    Undecodable: Row(
-        400, "undecodable-body", "The body cannot be decoded", "Empty or truncated body, broken JSON or .npy"
-    ),
     Unauthorized: Row(
         401, "unauthorized", "An API key is wanted", "API keys are configured, and the request has none of them"
     ),
     UnknownModel: Row(404, "unknown-model", "No such model", "The path names a model or version that is not loaded"),
+    Undecodable: _UNDECODABLE,
+    UnreadableFile: _UNDECODABLE,
     NotAcceptable: Row(
-        406, "not-acceptable", "No such answer format", "`Accept` asks for a format this version does not write"
+        406, "not-acceptable", "No such answer format", "`Accept` asks for other formats than the service's"
     ),
-    TooLarge: Row(413, "too-large", "The request is too large", "More bytes or points than the configured limits"),
+    TooLarge: _TOO_LARGE,
+    TooManyPoints: _TOO_LARGE,
     UnknownContentType: Row(
         415, "unknown-content-type", "The content type is not supported", "Unknown `Content-Type` or `Content-Encoding`"
     ),
-    Invalid: Row(
-        422,
-        "invalid-request",
-        "A value cannot be used",
-        "NaN, wrong shape, not metres, an option unknown or out of range",
-    ),
-    InvalidQuery: Row(
-        422,
-        "invalid-request",
-        "A value cannot be used",
-        "NaN, wrong shape, not metres, an option unknown or out of range",
-    ),
+    Invalid: _INVALID,
+    InvalidQuery: _INVALID,
     QueueFull: Row(
         429, "queue-full", "The queue is full", "Too many requests wait; `Retry-After` says when to come back"
     ),

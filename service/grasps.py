@@ -17,13 +17,12 @@ import anyio
 from starlette.requests import Request
 from starlette.responses import Response
 
-from service.answers import encode_answer
+from service.answers import encoder_for
 from service.batching import Answer, Job, PredictionWorker
 from service.errors import (
     ClientGone,
     DeadlineExceeded,
     Invalid,
-    NotAcceptable,
     NotReady,
     UnknownContentType,
     shortened,
@@ -31,7 +30,7 @@ from service.errors import (
 from service.intake import Intake
 from service.metrics import Metrics
 from service.middleware import RequestRecord
-from service.payloads import DECODERS, JSON, Decoder, build_query, merged, parse_options, parse_query_string
+from service.payloads import Decoder, build_query, decoder_for, merged, parse_options, parse_query_string
 from service.schemas import GraspOptions
 from service.settings import Settings
 from tesnet.query import GraspQuery
@@ -182,21 +181,21 @@ class GraspEndpoint:
             UnknownContentType, NotAcceptable, Invalid: what the head alone shows to be wrong.
         """
         decode = decoder_of(request)
-        check_accept(request.headers.get("accept", "*/*"))
+        encoder = encoder_for(request.headers.getlist("accept"))
         url_options = parse_query_string(request.scope["query_string"])
         parse_options(url_options)  # refuse a bad one before the body is read
         request_id = request.state.record.request_id
 
         def read(body: bytearray) -> Asked:
             payload = decode(body, self._settings.max_points)
-            options = parse_options(merged(url_options, payload.options))
+            options = parse_options(merged(url_options, payload.options), self._settings.max_points)
             check_model(options, self._worker.model)
 
             def write(result: GraspResult, timings_ms: Mapping[str, float]) -> Response:
-                content = encode_answer(result, options, self._worker.model, timings_ms, request_id)
-                return Response(content, media_type=JSON)
+                content = encoder.encode(result, options, self._worker.model, timings_ms, request_id)
+                return Response(content, media_type=encoder.content_type, headers={"Vary": "Accept"})
 
-            return Asked(build_query(payload.points, options), write)
+            return Asked(build_query(payload, options), write)
 
         return read
 
@@ -248,18 +247,14 @@ def decoder_of(request: Request) -> Decoder:
 
     Raises:
         UnknownContentType: there is none.
+        Undecodable: a form without a boundary.
     """
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
         raise UnknownContentType(
             f"Content-Encoding {shortened(encoding)} is not supported; send the body uncompressed."
         )
-    given = request.headers.get("content-type", "")
-    decoder = DECODERS.get(given.partition(";")[0].strip().lower())
-    if decoder is None:
-        what = f"Content-Type {shortened(given)} is not supported" if given else "Content-Type is missing"
-        raise UnknownContentType(f"{what}; send one of {', '.join(DECODERS)}.")
-    return decoder
+    return decoder_for(request.headers.get("content-type", ""))
 
 
 def check_model(options: GraspOptions, loaded: ModelInfo) -> None:
@@ -270,17 +265,6 @@ def check_model(options: GraspOptions, loaded: ModelInfo) -> None:
     """
     if options.model != loaded.name:
         raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {loaded.name}")
-
-
-def check_accept(accept: str) -> None:
-    """Refuse a client that takes nothing but arrays.
-
-    Raises:
-        NotAcceptable: JSON is the only format there is.
-    """
-    kinds = {part.partition(";")[0].strip().lower() for part in accept.split(",")}
-    if "application/x-npz" in kinds and not kinds & {JSON, "application/*", "*/*"}:
-        raise NotAcceptable(f"application/x-npz is not supported yet; accept {JSON}.")
 
 
 async def _hung_up(request: Request) -> None:

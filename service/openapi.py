@@ -7,9 +7,10 @@ from typing import Any
 from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
+from service.answers import NPZ
 from service.errors import PROBLEM_JSON, PROBLEMS, ClientGone, UnknownModel
-from service.payloads import JSON, NPY, OCTET_STREAM
-from service.schemas import GraspOptions, GraspRequest, GraspResponse, Problem
+from service.payloads import JSON, MULTIPART, NPY, OCTET_STREAM
+from service.schemas import DepthOptions, GraspOptions, GraspRequest, GraspResponse, Problem
 
 REF = "#/components/schemas/{model}"
 
@@ -32,6 +33,7 @@ def document_grasps(app: FastAPI) -> None:
                 [
                     (GraspRequest, "validation"),
                     (GraspOptions, "validation"),
+                    (DepthOptions, "validation"),
                     (GraspResponse, "validation"),
                     (Problem, "validation"),
                 ],
@@ -48,9 +50,10 @@ def document_grasps(app: FastAPI) -> None:
 def _grasps(options: dict[str, Any]) -> dict[str, Any]:
     """The operation object of `POST /grasps`."""
     return {
-        "description": "Send points as JSON, as raw little-endian float32 triples, or as a .npy array. Options go into "
-        "the JSON body or into the query string, each value as URL-encoded JSON (`viewpoint=[0.3,0,0.6]`); plain words "
-        "need no quotes; null means the default. Nothing found is a 200 with an empty list and a `reason`.",
+        "description": "Send points as JSON, as raw little-endian float32 triples, as a .npy array, or in a form as "
+        "a cloud file or a depth image. Options go into the JSON body, the form or the query string, each value "
+        "as URL-encoded JSON (`viewpoint=[0.3,0,0.6]`); plain words need no quotes; null means the default. Nothing "
+        "found is a 200 with an empty list and a `reason`.",
         "parameters": [
             {
                 "name": name,
@@ -94,12 +97,24 @@ def _grasps(options: dict[str, Any]) -> dict[str, Any]:
                         "description": "A .npy array (N, 3) of float32 or float64 in metres; never unpickled.",
                     }
                 },
+                MULTIPART: {"schema": _form(), "encoding": {"options": {"contentType": JSON}}},
             },
         },
         "responses": {
             "200": {
                 "description": "Grasps, best first.",
-                "content": {JSON: {"schema": {"$ref": REF.format(model="GraspResponse")}}},
+                "content": {
+                    JSON: {"schema": {"$ref": REF.format(model="GraspResponse")}},
+                    NPZ: {
+                        "schema": {
+                            "type": "string",
+                            "format": "binary",
+                            "description": "A .npz, for `Accept: application/x-npz`: arrays scores (M), poses "
+                            "(M, 4, 4) in `frame_convention`, hand_poses and pregrasps (M, 4, 4), widths (M), approach_points "
+                            "and contact_points (M, 3); and meta, the rest of the JSON document as text.",
+                        }
+                    },
+                },
             },
             **{
                 str(row.status): _problem(row.when, retry=row.status in (429, 503))
@@ -107,6 +122,25 @@ def _grasps(options: dict[str, Any]) -> dict[str, Any]:
                 if kind not in (ClientGone, UnknownModel)
             },
         },
+    }
+
+
+def _form() -> dict[str, Any]:
+    """The schema of a multipart body."""
+    files = {
+        "cloud": "A .npy, .ply or .pcd file (text, binary; binary_compressed .pcd too); either this or `depth`.",
+        "depth": "A depth image, 16-bit grey PNG, 0 where there is no depth; `options` holds its camera.",
+        "mask": "With `depth`: an 8-bit grey PNG of the same size, non-zero on the target.",
+    }
+    return {
+        "type": "object",
+        "properties": {
+            **{name: {"type": "string", "format": "binary", "description": text} for name, text in files.items()},
+            "options": {"$ref": REF.format(model="DepthOptions")},
+        },
+        "oneOf": [{"required": ["cloud"]}, {"required": ["depth", "options"]}],
+        "description": "Options go into the part `options`, a JSON object, or each into a part of its own name. The "
+        "camera (`intrinsics`, `T_cloud_camera`, `depth_scale`) belongs to a depth image alone.",
     }
 
 

@@ -7,11 +7,13 @@ otherwise.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
 from typing import Annotated, Literal
 
-from pydantic import BaseModel, ConfigDict, Field
+from pydantic import BaseModel, ConfigDict, Field, model_validator
+from pydantic_core import PydanticCustomError
 
-from tesnet.geometry import FrameConvention
+from tesnet.geometry import PANDA, FrameConvention
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS
 from tesnet.result import Reason
 
@@ -48,13 +50,73 @@ class Separation(RequestPart):
     rotation_deg: float = Field(default=15.0, ge=0, le=180, description="Degrees between the orientations, 0 to 180.")
 
 
+class Target(RequestPart):
+    """Where to grasp: a box, or some of the points. Exactly one of the two."""
+
+    box: Box | None = Field(default=None, description="Approach and contact point lie in this box.")
+    indices: Sequence[Annotated[int, Field(ge=0, lt=2**31)]] | None = Field(
+        default=None,
+        description="Numbers of the target's points, from 0: rows of the posted cloud, or pixels of a depth image row "
+        "by row.",
+    )
+
+    @model_validator(mode="after")
+    def _one_of_two(self) -> Target:
+        if (self.box is None) == (self.indices is None):
+            raise PydanticCustomError("target", "give either `box` or `indices`")
+        return self
+
+
+Length = Annotated[float, Field(gt=0, le=0.5)]
+
+
+class GripperSize(RequestPart):
+    """A two-finger parallel hand, metres; what is left out is the Panda hand's.
+
+    A part whose size is given is straight, unless its narrower end is given as well.
+    """
+
+    max_width: Annotated[float, Field(ge=0.005, le=PANDA.max_width)] = Field(
+        default=PANDA.max_width,
+        description=f"Opening between the pads, 0.005 to {PANDA.max_width:g}: no network was trained with a wider one.",
+    )
+    finger_depth: Annotated[float, Field(ge=0.015, le=0.5)] = Field(
+        default=PANDA.finger_depth, description="Usable length of the fingers, measured back from the tips."
+    )
+    finger_thickness: Length = Field(
+        default=PANDA.finger_thickness, description="Extent of one finger along the closing direction, at its root."
+    )
+    finger_tip_thickness: Length = Field(default=PANDA.finger_tip_thickness, description="The same, at its tip.")
+    finger_taper: Length = Field(
+        default=PANDA.finger_taper, description="Over how much of its length, from the tip, a finger gets thicker."
+    )
+    finger_breadth: Length = Field(
+        default=PANDA.finger_breadth, description="Extent of one finger across the hand's plane."
+    )
+    finger_tip_breadth: Length = Field(default=PANDA.finger_tip_breadth, description="The same, at its very tip.")
+    palm_depth: Length = Field(
+        default=PANDA.palm_depth, description="Extent of the hand's body along the direction of travel."
+    )
+    palm_length: Length = Field(
+        default=PANDA.palm_length, description="Extent of the hand's body along the closing direction."
+    )
+    palm_breadth: Length = Field(
+        default=PANDA.palm_breadth, description="Extent of the hand's body across the hand's plane."
+    )
+    palm_front_breadth: Length = Field(default=PANDA.palm_front_breadth, description="The same, at the fingers.")
+    palm_taper: Length = Field(
+        default=PANDA.palm_taper, description="Over how much of its depth, from the fingers, the body gets broader."
+    )
+
+
 class GraspOptions(RequestPart):
     """Every option of `POST /grasps`, all optional, with the same names in a JSON body and in a query string."""
 
     viewpoint: Vector | Annotated[list[Vector], Field(min_length=1, max_length=MAX_VIEWPOINTS)] | None = Field(
         default=None,
         description=f"Camera position [x, y, z] in the cloud frame, or a list of up to {MAX_VIEWPOINTS} of them for a "
-        "fused cloud; turns normals towards the camera. Default: the origin, and `warnings` says so.",
+        "fused cloud; turns normals towards the camera. Default: the camera of a depth image; of a cloud the origin, "
+        "and `warnings` says so.",
     )
     up: Vector | None = Field(
         default=None,
@@ -65,10 +127,17 @@ class GraspOptions(RequestPart):
         default=None,
         description='Box {"min": [x, y, z], "max": [x, y, z]} in metres; points outside are ignored. Default: none.',
     )
-    support_height: float | None = Field(
+    support_height: float | Literal["auto"] | None = Field(
         default=None,
         description="Height of the support plane along `up` in metres (needs `up`): points lower than 5 mm above it "
-        "are dropped, and the hand stays 4 mm clear of it. Default: none.",
+        "are dropped, and the hand stays 4 mm clear of it. `auto` finds the dominant plane across `up`, and `warnings` "
+        "says where. Default: none.",
+    )
+    target: Target | None = Field(
+        default=None,
+        description='Where to grasp: {"box": {"min": [x, y, z], "max": [x, y, z]}} or {"indices": [whole numbers]}, '
+        "the posted points by their number from 0. Candidates come from it alone; the other points still count for "
+        "collision. Default: everything.",
     )
     approach: Approach | None = Field(
         default=None,
@@ -94,6 +163,12 @@ class GraspOptions(RequestPart):
     max_candidates: int = Field(
         default=2000, ge=1, le=MAX_CANDIDATES, description=f"Search effort: candidates scored, 1 to {MAX_CANDIDATES}."
     )
+    gripper: GripperSize | None = Field(
+        default=None,
+        description='The hand, {"max_width": metres, "finger_depth": metres, "finger_thickness": metres, ...}; '
+        f"max_width is at most {PANDA.max_width:g}, the opening that the networks were trained with. Default: the "
+        "Panda hand.",
+    )
     unseen: Literal["free", "occupied"] = Field(
         default="free",
         description="What the collision check takes the shadow behind observed points for: free or occupied.",
@@ -113,6 +188,31 @@ class GraspRequest(GraspOptions):
     """Body of `POST /grasps` as `application/json`. `service.payloads` decodes the points, not this model."""
 
     points: list[Vector] = Field(description="The point cloud: [[x, y, z], ...] in metres, finite.")
+
+
+class Intrinsics(RequestPart):
+    """A pinhole camera without distortion, pixels."""
+
+    fx: float = Field(gt=0, le=1e6, description="Focal length along a row.")
+    fy: float = Field(gt=0, le=1e6, description="Focal length along a column.")
+    cx: float = Field(ge=-1e6, le=1e6, description="Column of the optical axis; the first pixel's centre is 0.")
+    cy: float = Field(ge=-1e6, le=1e6, description="Row of the optical axis.")
+
+
+class DepthCamera(RequestPart):
+    """What a depth image needs to become a cloud."""
+
+    intrinsics: Intrinsics = Field(description='Camera {"fx": ..., "fy": ..., "cx": ..., "cy": ...} in pixels.')
+    T_cloud_camera: Matrix | None = Field(
+        default=None,
+        description="Camera pose as a 4 x 4 matrix, row by row; camera axes are +x right, +y down, +z forward. "
+        "Default: the cloud frame is the camera frame.",
+    )
+    depth_scale: float = Field(default=0.001, gt=0, le=1, description="Metres per count, more than 0, at most 1.")
+
+
+class DepthOptions(GraspOptions, DepthCamera):
+    """The options of a request with a depth image."""
 
 
 class ResponsePart(BaseModel):

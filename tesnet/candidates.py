@@ -7,7 +7,7 @@ down in CONVENTIONS.md. Vectorised torch; lengths in metres; everything in the c
 from __future__ import annotations
 
 import math
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 
 import torch
 from torch import Tensor
@@ -63,21 +63,26 @@ class Candidates:
         return Candidates(self.approach[which], self.contact[which], self.Ts_canonical_grasp[which])
 
 
-def generate(
-    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, gripper: Gripper = PANDA
-) -> tuple[Candidates, dict[str, int]]:
-    """At most `max_candidates` candidates, and how many pairs each mask dropped (support, from_below, approach).
+def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -> tuple[Candidates, dict[str, int]]:
+    """At most `max_candidates` candidates, and how many pairs each mask dropped.
 
-    While the approach points yield fewer than half of that, as beside flat objects, four times as many are tried.
+    Approach points lie on the target, if there is one. While they yield fewer than half of `max_candidates`, as beside
+    flat objects, four times as many are tried.
     """
+    allowed = torch.arange(len(cloud), device=cloud.points.device)
+    if cloud.on_target is not None:
+        allowed = allowed[cloud.on_target]
+    if len(allowed) == 0:
+        return _no_candidates(cloud), {}
+    narrower = (PANDA.max_width - query.gripper.max_width) / 2
+    config = replace(config, max_offset=config.max_offset - narrower)
     generator = torch.Generator().manual_seed(query.seed)
-    start = int(torch.randint(len(cloud), (1,), generator=generator))
+    start = int(torch.randint(len(allowed), (1,), generator=generator))
     count = query.num_approach_points
     while True:
-        candidates, alive, rejected = _search(
-            cloud, query, config, gripper, farthest_points(cloud.points, count, start)
-        )
-        if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(cloud), MAX_APPROACH_POINTS):
+        approach_points = allowed[farthest_points(cloud.points[allowed], count, start)]
+        candidates, alive, rejected = _search(cloud, query, config, approach_points)
+        if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
             break
         count = min(4 * count, MAX_APPROACH_POINTS)  # time and memory grow with it
     survivors = alive.nonzero()[:, 0]
@@ -87,8 +92,13 @@ def generate(
     return candidates.select(survivors), rejected
 
 
+def _no_candidates(cloud: PreparedCloud) -> Candidates:
+    nothing = torch.empty(0, dtype=torch.long, device=cloud.points.device)
+    return Candidates(nothing, nothing, cloud.points.new_empty(0, 4, 4))
+
+
 def _search(
-    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, gripper: Gripper, approach_points: Tensor
+    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, approach_points: Tensor
 ) -> tuple[Candidates, Tensor, dict[str, int]]:
     """The pairs in reach of the approach points, a mask of those that no rule drops, and how many each rule does."""
     approach, contact = pairs_in_reach(cloud, approach_points, config)
@@ -97,7 +107,8 @@ def _search(
     masks = {
         "from_below": _comes_from_behind(cloud, candidates, config),
         "approach": _outside_cone(cloud, poses[:, :3, 2], query),
-        "support": hand_clearance(cloud, poses, gripper) < config.support_clearance,
+        "support": hand_clearance(cloud, poses, query.gripper) < config.support_clearance,
+        "target": _off_target(cloud, contact),
     }
     rejected = {}
     alive = torch.ones(len(candidates), dtype=torch.bool, device=poses.device)
@@ -191,6 +202,12 @@ def _comes_from_behind(cloud: PreparedCloud, candidates: Candidates, config: Can
     z = candidates.Ts_canonical_grasp[:, :3, 2]
     against = cloud.view_directions[candidates.approach] if cloud.up is None else cloud.up.expand_as(z)
     return (z * against).sum(dim=1) >= config.max_upward
+
+
+def _off_target(cloud: PreparedCloud, contact: Tensor) -> Tensor:
+    if cloud.on_target is None:
+        return torch.zeros(len(contact), dtype=torch.bool, device=contact.device)
+    return ~cloud.on_target[contact]
 
 
 def _outside_cone(cloud: PreparedCloud, z: Tensor, query: GraspQuery) -> Tensor:

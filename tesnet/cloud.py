@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 
 from tesnet.geometry import Pose
-from tesnet.query import GraspQuery
+from tesnet.query import Box, GraspQuery
 
 MINIMUM_POINTS = 32
 """Fewer prepared points than this describe no surface to grasp."""
@@ -60,6 +60,7 @@ class PreparedCloud:
         up: (3,) or None.
         support_height: along `up`, in this frame, or None.
         T_cloud_canonical: back to the frame of the query.
+        on_target: (P,) mask of the points that candidates may come from; None is all of them.
         dropped_far, dropped_surplus: points ignored because of `max_extent` and of `max_points`.
     """
 
@@ -72,6 +73,7 @@ class PreparedCloud:
     up: Tensor | None
     support_height: float | None
     T_cloud_canonical: Pose
+    on_target: Tensor | None = None
     dropped_far: int = 0
     dropped_surplus: int = 0
 
@@ -80,15 +82,17 @@ class PreparedCloud:
 
 
 def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) -> PreparedCloud | None:
-    """The prepared cloud of a query, or None when no point lies in the workspace above the support plane."""
-    raw = torch.from_numpy(query.points.copy()).to(device)
-    points = crop(raw, query)
-    median = points.median(dim=0).values if len(points) else torch.zeros(3, device=device)
-    near = ((points - median).norm(dim=1) <= config.max_extent) if len(points) else torch.zeros(0, dtype=torch.bool)
-    dropped_far = int((~near).sum())
-    points = points[near] if dropped_far else points
-    if len(points) == 0:
+    """The prepared cloud of a query, or None when no point lies in the workspace above the support plane.
+
+    A support height that is still to be found (`tesnet.support`) counts as none.
+    """
+    table = crop(_with_target(query).to(device), query)
+    if len(table) == 0:
         return None
+    near = (table[:, :3] - table[:, :3].median(dim=0).values).norm(dim=1) <= config.max_extent
+    dropped_far = int((~near).sum())
+    table = table[near] if dropped_far else table
+    points = table[:, :3]
 
     viewpoints = torch.zeros(1, 3) if query.viewpoints is None else torch.tensor(query.viewpoints)
     up = None if query.up is None else torch.tensor(query.up)
@@ -99,20 +103,25 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     def to_canonical(positions: Tensor) -> Tensor:
         return ((positions.double() - origin.to(positions.device)) @ rotation.to(positions.device)).float()
 
-    points = voxel_downsample(to_canonical(points), config.voxel_size)
+    table = voxel_downsample(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config.voxel_size)
     viewpoints = to_canonical(viewpoints).to(device)
+    on_target = _on_target(query, table, T_cloud_canonical)
+    points = table[:, :3].contiguous()
     dropped_surplus = max(0, len(points) - config.max_points)
     if dropped_surplus:
-        distance = (points - points.median(dim=0).values).norm(dim=1)
-        points = points[distance.argsort(stable=True)[: config.max_points].sort().values]
+        wanted = points if on_target is None or not bool(on_target.any()) else points[on_target]
+        distance = (points - wanted.median(dim=0).values).norm(dim=1)
+        kept = distance.argsort(stable=True)[: config.max_points].sort().values
+        points, on_target = points[kept], None if on_target is None else on_target[kept]
 
     neighbours = nearest_neighbours(points, max(config.normal_neighbours, config.outlier_neighbours + 1))
     keep = ~statistical_outliers(points, neighbours[:, : config.outlier_neighbours + 1], config.outlier_std_ratio)
     points, neighbours = drop_points(points, neighbours, keep)
+    on_target = None if on_target is None else on_target[keep]
     normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
     normals, view_directions = orient_normals(points, normals, viewpoints)
     support_height = None
-    if query.up is not None and query.support_height is not None:
+    if query.up is not None and isinstance(query.support_height, float):
         support_height = float(query.support_height - T_cloud_canonical.translation @ query.up)
     return PreparedCloud(
         points=points,
@@ -124,21 +133,44 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
         up=None if up is None else (up @ rotation).float().to(device),
         support_height=support_height,
         T_cloud_canonical=T_cloud_canonical,
+        on_target=on_target,
         dropped_far=dropped_far,
         dropped_surplus=dropped_surplus,
     )
 
 
 def crop(points: Tensor, query: GraspQuery) -> Tensor:
-    """Points (N, 3) inside the query's workspace and at least 5 mm above its support plane."""
+    """Rows (N, 3 or more), beginning with x, y, z, inside the query's workspace and 5 mm or more above its support."""
     if query.workspace is not None:
-        low = torch.tensor(query.workspace.minimum, dtype=points.dtype, device=points.device)
-        high = torch.tensor(query.workspace.maximum, dtype=points.dtype, device=points.device)
-        points = points[((points >= low) & (points <= high)).all(dim=1)]
-    if query.support_height is not None and query.up is not None:
-        heights = points @ torch.tensor(query.up, dtype=points.dtype, device=points.device)
+        points = points[_inside(points, query.workspace)]
+    if isinstance(query.support_height, float) and query.up is not None:
+        heights = points[:, :3] @ torch.tensor(query.up, dtype=points.dtype, device=points.device)
         points = points[heights >= query.support_height + SUPPORT_CLEARANCE]
     return points
+
+
+def _inside(points: Tensor, box: Box) -> Tensor:
+    low = torch.tensor(box.minimum, dtype=points.dtype, device=points.device)
+    high = torch.tensor(box.maximum, dtype=points.dtype, device=points.device)
+    return ((points[:, :3] >= low) & (points[:, :3] <= high)).all(dim=1)
+
+
+def _with_target(query: GraspQuery) -> Tensor:
+    """The query's points (N, 3) or, where its target is a mask, (N, 4) with 1 in the last column for the target."""
+    points = torch.from_numpy(query.points.copy())
+    if query.target is None or isinstance(query.target, Box):
+        return points
+    return torch.cat([points, torch.from_numpy(query.target.copy()).to(points.dtype)[:, None]], dim=1)
+
+
+def _on_target(query: GraspQuery, table: Tensor, T_cloud_canonical: Pose) -> Tensor | None:
+    """Mask (V,) of rows that lie in the target's box, or whose cell has at least as many target points as others."""
+    if query.target is None:
+        return None
+    if not isinstance(query.target, Box):
+        return table[:, 3] >= 0.5
+    in_cloud = torch.from_numpy(T_cloud_canonical.apply(table[:, :3].cpu().numpy()))
+    return _inside(in_cloud, query.target).to(table.device)
 
 
 def canonical_frame(points: Tensor, viewpoints: Tensor, up: Tensor | None) -> Pose:
@@ -176,15 +208,16 @@ def _unit_or_none(vector: Tensor) -> Tensor | None:
 
 
 def voxel_downsample(points: Tensor, voxel_size: float) -> Tensor:
-    """The mean of the points (N, 3) in every occupied cell, (V, 3), in the order of the cells.
+    """The mean of the rows (N, 3 or more), which begin with x, y, z, in every occupied cell, in the order of the cells.
 
     The grid's corner lies half a cell below the smallest coordinates, as in Open3D.
     """
-    cells = ((points - points.min(dim=0).values) / voxel_size + 0.5).floor().long()
+    corner = points[:, :3].min(dim=0).values
+    cells = ((points[:, :3] - corner) / voxel_size + 0.5).floor().long()
     extent = cells.max(dim=0).values + 1
     keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
     _, cell_of_point, counts = keys.unique(return_inverse=True, return_counts=True)
-    sums = torch.zeros(len(counts), 3, dtype=torch.float64, device=points.device)
+    sums = torch.zeros(len(counts), points.shape[1], dtype=torch.float64, device=points.device)
     sums.index_add_(0, cell_of_point, points.double())
     means: Tensor = (sums / counts[:, None]).to(points.dtype)
     return means

@@ -3,9 +3,11 @@
 ::
 
     TesnetError
-    +-- InvalidQuery    a cloud or an option that no grasp can be computed from; `field` names it
-    +-- WeightsError    a weights file that is missing, corrupted or of another network; `path` names it
-    +-- DeviceError     a compute device that this machine does not have
+    +-- InvalidQuery     a cloud or an option that no grasp can be computed from; `field` names it
+    +-- UnreadableFile   a cloud file that is damaged, or of another format than its reader's
+    +-- TooManyPoints    a cloud file with more points than the caller's limit
+    +-- WeightsError     a weights file that is missing, corrupted or of another network; `path` names it
+    +-- DeviceError      a compute device that this machine does not have
 
 Messages give the value, the limit and the remedy. They never contain the cloud.
 """
@@ -31,6 +33,24 @@ class InvalidQuery(TesnetError):
         super().__init__(f"{field}: {message}")
         self.field = field
         self.message = message
+
+
+class UnreadableFile(TesnetError):
+    """The content of a cloud file is damaged, or is no file of that format."""
+
+
+class TooManyPoints(TesnetError):
+    """A cloud has more points than may be.
+
+    Args:
+        count: how many it has or claims to have; words where they were not counted to the end.
+        limit: how many may be.
+    """
+
+    def __init__(self, count: int | str, limit: int) -> None:
+        super().__init__(f"The cloud has {count} points (limit {limit}); crop or downsample it.")
+        self.count = count
+        self.limit = limit
 
 
 class WeightsError(TesnetError):

@@ -11,7 +11,7 @@ from typing import Any
 import numpy as np
 import torch
 
-from tesnet import candidates, cloud, collision, networks, ranking, weights
+from tesnet import candidates, cloud, collision, networks, ranking, support, weights
 from tesnet.errors import DeviceError, WeightsError
 from tesnet.geometry import PANDA, GraspSet
 from tesnet.networks import Network
@@ -130,6 +130,9 @@ class GraspPredictor:
         clock = _Clock()
         rejected = dict.fromkeys(REJECTIONS, 0)
         notes = _query_warnings(query)
+        if query.support_height == "auto":
+            query, note = support.settled(query, self.device)
+            notes.append(note)
 
         prepared = cloud.prepare(query, self._preparation, self.device)
         self._synchronise()
@@ -140,6 +143,7 @@ class GraspPredictor:
             reason: Reason = "no_points_in_workspace" if outside else "too_few_points"
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
         notes += _cloud_warnings(prepared, self._preparation)
+        notes += _target_warnings(prepared)
 
         found, dropped = candidates.generate(prepared, query, self._candidates)
         rejected |= dropped
@@ -185,7 +189,7 @@ class GraspPredictor:
             separation_rotation_deg=query.separation_rotation_deg,
         )
         rejected = proposal.rejected | {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
-        grasps = _grasps(prepared, free, scores, ranked.indices)
+        grasps = _grasps(prepared, free, scores, ranked.indices, query.gripper.max_width)
         clock.lap("rank")
         return GraspResult(
             grasps=grasps,
@@ -196,10 +200,10 @@ class GraspPredictor:
         )
 
     def _blocked(self, prepared: cloud.PreparedCloud, found: candidates.Candidates, query: GraspQuery) -> torch.Tensor:
-        poses = found.Ts_canonical_grasp
-        blocked = collision.in_collision(prepared, poses, PANDA, PANDA.max_width, APPROACH_DISTANCE)
+        poses, hand = found.Ts_canonical_grasp, query.gripper
+        blocked = collision.in_collision(prepared, poses, hand, hand.max_width, APPROACH_DISTANCE)
         if query.unseen == "occupied":
-            blocked |= collision.in_shadow(prepared, poses, PANDA, PANDA.max_width)
+            blocked |= collision.in_shadow(prepared, poses, hand, hand.max_width)
         return blocked
 
     def _synchronise(self) -> None:
@@ -278,7 +282,15 @@ def _query_warnings(query: GraspQuery) -> list[str]:
         notes.append("viewpoint not given: the camera is taken to be at the origin of the cloud frame")
     if query.up is None:
         notes.append("up not given: grasps from below are not filtered, only those that come from behind what is seen")
+    if query.gripper != PANDA:
+        notes.append("gripper is not the hand that the network was trained with: only collision and width follow it")
     return notes
+
+
+def _target_warnings(prepared: cloud.PreparedCloud) -> list[str]:
+    if prepared.on_target is None or bool(prepared.on_target.any()):
+        return []
+    return ["target holds none of the points that are left after crop and voxel grid: nothing can be grasped there"]
 
 
 def _cloud_warnings(prepared: cloud.PreparedCloud, config: cloud.PreparationConfig) -> list[str]:
@@ -315,15 +327,19 @@ def _nothing(
 
 
 def _grasps(
-    prepared: cloud.PreparedCloud, free: candidates.Candidates, scores: torch.Tensor, indices: torch.Tensor
+    prepared: cloud.PreparedCloud,
+    free: candidates.Candidates,
+    scores: torch.Tensor,
+    indices: torch.Tensor,
+    width: float,
 ) -> GraspSet:
-    """The candidates at the indices (M,), back in the frame of the query."""
+    """The candidates at the indices (M,), back in the frame of the query, for a hand opened to `width`."""
     chosen = free.select(indices.to(scores.device))
     to_cloud = prepared.T_cloud_canonical
     return GraspSet(
         scores=scores[indices.to(scores.device)].cpu().double().numpy(),
         Ts_cloud_grasp=to_cloud.matrix @ chosen.Ts_canonical_grasp.cpu().double().numpy(),
-        widths=np.full(len(indices), PANDA.max_width),
+        widths=np.full(len(indices), width),
         approach_points=to_cloud.apply(prepared.points[chosen.approach].cpu().numpy()),
         contact_points=to_cloud.apply(prepared.points[chosen.contact].cpu().numpy()),
     )

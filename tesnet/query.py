@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from dataclasses import dataclass
-from typing import Any, Literal
+from typing import Any, Literal, TypeAlias
 
 import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tesnet.errors import InvalidQuery
+from tesnet.geometry import PANDA, Gripper
 
 MAX_GRASPS = 1000
 MAX_APPROACH_POINTS = 1024
@@ -70,20 +71,29 @@ def _whole_in_range(field: str, value: Any, low: int, high: int) -> None:
 class Box:
     """Axis-aligned box in the cloud frame, metres.
 
+    Args:
+        minimum, maximum: its corners (3,).
+        field: the option that it is given as.
+
     Raises:
         InvalidQuery: a minimum that is not below its maximum.
     """
 
     minimum: NDArray[np.float64]
     maximum: NDArray[np.float64]
+    field: Literal["workspace", "target"] = "workspace"
 
     def __post_init__(self) -> None:
         for name in ("minimum", "maximum"):
-            object.__setattr__(self, name, _vector("workspace", getattr(self, name), (3,)))
+            object.__setattr__(self, name, _vector(self.field, getattr(self, name), (3,)))
         if not (self.minimum < self.maximum).all():
             raise InvalidQuery(
-                "workspace", f"min {self.minimum.tolist()} is not below max {self.maximum.tolist()} on every axis"
+                self.field, f"min {self.minimum.tolist()} is not below max {self.maximum.tolist()} on every axis"
             )
+
+
+Target: TypeAlias = Box | NDArray[np.bool_]
+"""Where to grasp: a box, or a mask (N,) of the query's points."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -107,11 +117,13 @@ class GraspQuery:
         viewpoints: (3,) or (V, 3) camera positions in the cloud frame; None is the origin.
         up: (3,) direction against gravity, made unit length.
         workspace: points outside are ignored.
-        support_height: height of the support plane along `up`, metres.
+        support_height: height of the support plane along `up`, metres, or `auto` to find the dominant plane.
+        target: candidates come from it alone; the other points still count for collision.
         approach: cone of directions of travel.
         max_grasps, min_score: how many to return, and the least score.
         separation_translation, separation_rotation_deg: grasps nearer than both to a better one are dropped.
         num_approach_points, max_candidates: search effort.
+        gripper: the hand, which opens no wider than the one that the networks were trained with.
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
         seed: makes sampling repeatable.
 
@@ -123,7 +135,8 @@ class GraspQuery:
     viewpoints: NDArray[np.float64] | None = None
     up: NDArray[np.float64] | None = None
     workspace: Box | None = None
-    support_height: float | None = None
+    support_height: float | Literal["auto"] | None = None
+    target: Target | None = None
     approach: ApproachCone | None = None
     max_grasps: int = 10
     min_score: float = 0.0
@@ -131,6 +144,7 @@ class GraspQuery:
     separation_rotation_deg: float = 15.0
     num_approach_points: int = 32
     max_candidates: int = 2000
+    gripper: Gripper = PANDA
     unseen: Literal["free", "occupied"] = "free"
     seed: int = 0
 
@@ -149,7 +163,16 @@ class GraspQuery:
         if self.support_height is not None:
             if self.up is None:
                 raise InvalidQuery("support_height", "needs `up`: a height is measured along it; give `up` as well")
-            _in_range("support_height", self.support_height, -MAX_DISTANCE, MAX_DISTANCE, " m")
+            if self.support_height != "auto":
+                _in_range("support_height", self.support_height, -MAX_DISTANCE, MAX_DISTANCE, " m, or be auto")
+                object.__setattr__(self, "support_height", float(self.support_height))
+        if self.target is not None and not isinstance(self.target, Box):
+            object.__setattr__(self, "target", _mask(self.target, len(self.points)))
+        if not isinstance(self.gripper, Gripper):
+            raise InvalidQuery("gripper", f"is of type {type(self.gripper).__name__}; give a Gripper")
+        _in_range(
+            "gripper", self.gripper.max_width, 0, PANDA.max_width, " m in max_width: no network knows a wider hand"
+        )
         for name, kind in (("workspace", Box), ("approach", ApproachCone)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
@@ -163,6 +186,16 @@ class GraspQuery:
         _whole_in_range("seed", self.seed, 0, 2**63 - 1)
         if self.unseen not in ("free", "occupied"):
             raise InvalidQuery("unseen", f"is {self.unseen!r}; valid: free, occupied")
+
+
+def _mask(target: ArrayLike, count: int) -> NDArray[np.bool_]:
+    mask = np.array(target)
+    if mask.dtype != np.bool_ or mask.shape != (count,):
+        raise InvalidQuery(
+            "target", f"is an array of {mask.dtype} of shape {mask.shape}; give a Box, or a mask of the {count} points"
+        )
+    mask.setflags(write=False)
+    return mask
 
 
 def _cloud(points: ArrayLike) -> NDArray[np.float32]:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from collections.abc import Mapping
 from dataclasses import dataclass
 
 import numpy as np
@@ -9,6 +10,16 @@ from numpy.typing import NDArray
 
 HAND_TO_TCP = 0.1034
 """Metres from the origin of `panda_hand` to the TCP, along z."""
+
+PALM_OVERLAP = 0.004
+"""Metres of the usable finger depth that the hand's body covers."""
+
+_TAPERED = {
+    "finger_thickness": "finger_tip_thickness",
+    "finger_breadth": "finger_tip_breadth",
+    "palm_breadth": "palm_front_breadth",
+}
+"""Each size of a part, and the size of its narrower end."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -31,7 +42,7 @@ class Gripper:
         palm_taper: length of its taper, measured back from the fingers.
 
     Raises:
-        ValueError: a length that is not positive.
+        ValueError: a length that is not positive, an end broader than its part, fingers too short for the TCP.
     """
 
     max_width: float = 0.08
@@ -52,16 +63,52 @@ class Gripper:
         for name in self.__slots__:
             if not getattr(self, name) > 0:
                 raise ValueError(f"{name} is {getattr(self, name)}; a gripper's lengths are positive, in metres")
+        for whole, end in _TAPERED.items():
+            if getattr(self, end) > getattr(self, whole):
+                raise ValueError(
+                    f"{end} is {getattr(self, end)}, more than {whole} ({getattr(self, whole)}); give both, the end "
+                    "not larger than the whole"
+                )
+        if not self.palm_front < 0:
+            raise ValueError(
+                f"finger_depth is {self.finger_depth}; it must exceed {self.tip_offset + PALM_OVERLAP:g} m, or the "
+                "palm would lie between the pads"
+            )
+
+    # Factories
+
+    @classmethod
+    def like_panda(cls, lengths: Mapping[str, float]) -> Gripper:
+        """A hand that differs from the Panda's in the lengths given, by their names.
+
+        A part whose size is given is straight, unless its tapered end is given as well; a taper that would be longer
+        than its part is cut.
+
+        Raises:
+            ValueError: as for any `Gripper`.
+        """
+        given = dict(lengths)
+        for whole, end in _TAPERED.items():
+            if whole in given:
+                given.setdefault(end, given[whole])
+        hand = cls(**given)
+        given["finger_taper"] = min(hand.finger_taper, hand.finger_length)
+        given["palm_taper"] = min(hand.palm_taper, hand.palm_depth)
+        return cls(**given)
+
+    # Accessors
 
     @property
     def finger_length(self) -> float:
         """Metres from the hand's body to the fingertips; the body reaches 4 mm into the usable finger depth."""
-        return self.finger_depth - 0.004
+        return self.finger_depth - PALM_OVERLAP
 
     @property
     def palm_front(self) -> float:
         """Where, along z, the palm's face between the fingers lies."""
         return self.tip_offset - self.finger_length
+
+    # Operations
 
     def corners(self, width: float) -> NDArray[np.float64]:
         """Extreme points (K, 3) of the hand in the grasp frame; their convex hull contains each finger and the palm.

@@ -189,7 +189,8 @@ INVALID_OPTIONS: dict[str, tuple[str, Any, str]] = {
     "workspace without max": ("workspace", {"min": [0, 0, 0]}, "max"),
     "workspace with another name": ("workspace", {"min": [0, 0, 0], "max": [1, 1, 1], "mid": 0}, "mid"),
     "support_height without up": ("support_height", 0.1, "up"),
-    "support_height auto": ("support_height", "auto", "not supported yet"),
+    "support_height auto without up": ("support_height", "auto", "up"),
+    "support_height of another word": ("support_height", "low", "auto"),
     "approach cone beyond the sphere": ("approach", {"direction": [0, 0, -1], "max_angle_deg": 181}, "180"),
     "approach without an angle": ("approach", {"direction": [0, 0, -1]}, "max_angle_deg"),
     "approach in no direction": ("approach", {"direction": [0, 0, 0], "max_angle_deg": 10}, "length"),
@@ -200,8 +201,21 @@ INVALID_OPTIONS: dict[str, tuple[str, Any, str]] = {
     "pregrasp_distance of two metres": ("pregrasp_distance", 2, "1"),
     "frame_convention unknown": ("frame_convention", "ros", "contact_graspnet"),
     "model that is not loaded": ("model", "edgegrasp", "tesnet"),
-    "target": ("target", {"indices": [0]}, "not supported yet"),
-    "gripper": ("gripper", {"max_width": 0.05}, "not supported yet"),
+    "target of nothing": ("target", {}, "box"),
+    "target of two kinds": ("target", {"box": {"min": [0, 0, 0], "max": [1, 1, 1]}, "indices": [0]}, "either"),
+    "target of another kind": ("target", {"mask": [0]}, "mask"),
+    "target box inside out": ("target", {"box": {"min": [0, 0, 0], "max": [1, -1, 1]}}, "min"),
+    "target index beyond the cloud": ("target", {"indices": [0, 3]}, "index 3, but 3 points"),
+    "target index below zero": ("target", {"indices": [-1]}, "greater than or equal to 0"),
+    "target index of half a point": ("target", {"indices": [0.5]}, "integer"),
+    "target index that is true": ("target", {"indices": [True]}, "integer"),
+    "target index beyond 64 bits": ("target", {"indices": [2**70]}, "target"),
+    "gripper wider than the network knows": ("gripper", {"max_width": 0.081}, "0.08"),
+    "gripper that does not open": ("gripper", {"max_width": 0}, "0.005"),
+    "gripper without fingers": ("gripper", {"finger_depth": 0.01}, "0.015"),
+    "gripper broader at its tip": ("gripper", {"finger_thickness": 0.01, "finger_tip_thickness": 0.02}, "finger_tip"),
+    "gripper with another name": ("gripper", {"width": 0.05}, "width"),
+    "intrinsics without a depth image": ("intrinsics", {"fx": 1}, "depth"),
     "unknown": ("max_graps", 3, "max_grasps"),
     "unknown and far from all": ("zzz", 3, "viewpoint"),
     "long": ("model", "m" * 100_000, "too long"),
@@ -261,9 +275,7 @@ def test_a_timeout_that_is_no_number_of_seconds_is_a_422(http: httpx.Client, giv
     assert problem_of(answer, 422, "3600").field == "X-Request-Timeout"
 
 
-@pytest.mark.parametrize(
-    "content_type", ["text/plain", "multipart/form-data; boundary=x", "application/x-npz", "", "/"]
-)
+@pytest.mark.parametrize("content_type", ["text/plain", "multipart/mixed; boundary=x", "application/x-npz", "", "/"])
 def test_an_unknown_content_type_is_a_415_that_names_the_known(http: httpx.Client, content_type: str) -> None:
     answer = http.post("/grasps", content=b"x", headers={"Content-Type": content_type})
     problem_of(answer, 415, "application/json", "application/octet-stream", "application/x-npy")
@@ -283,11 +295,10 @@ def test_content_type_parameters_and_case_do_not_matter(http: httpx.Client) -> N
     assert answer.status_code == 200
 
 
-def test_an_answer_of_arrays_alone_is_a_406(http: httpx.Client) -> None:
-    answer = http.post("/grasps", json={"points": TRIANGLE}, headers={"Accept": "application/x-npz"})
-    problem_of(answer, 406, "not supported yet")
-    either = http.post("/grasps", json={"points": TRIANGLE}, headers={"Accept": "application/x-npz, */*;q=0.1"})
-    assert either.status_code == 200
+@pytest.mark.parametrize("accept", ["text/html", "image/*;q=0.5, text/plain", "*/*;q=0", "json"])
+def test_an_answer_in_no_format_that_there_is_is_a_406(http: httpx.Client, accept: str) -> None:
+    answer = http.post("/grasps", json={"points": TRIANGLE}, headers={"Accept": accept})
+    problem_of(answer, 406, "application/json", "application/x-npz")
 
 
 def test_one_point_too_many_is_a_413_in_every_content_type(http: httpx.Client) -> None:

@@ -12,7 +12,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.schemas import GraspOptions, GraspRequest, GraspResponse, ModelResponse
+from service.schemas import DepthOptions, GraspOptions, GraspRequest, GraspResponse, ModelResponse
 from tesnet.geometry import HAND_TO_TCP, Pose
 from tesnet.result import REJECTIONS
 
@@ -23,12 +23,14 @@ OPTIONS: dict[str, Any] = {
     "up": [0, 0, 1],
     "workspace": {"min": [-0.2, -0.2, -0.05], "max": [0.2, 0.2, 0.3]},
     "support_height": 0.0,
+    "target": {"box": {"min": [-0.05, -0.05, 0.0], "max": [0.05, 0.05, 0.2]}},
     "approach": {"direction": [0, 0, -1], "max_angle_deg": 120},
     "max_grasps": 5,
     "min_score": 0.0,
     "min_separation": {"translation": 0.005, "rotation_deg": 10},
     "num_approach_points": 24,
     "max_candidates": 400,
+    "gripper": {"max_width": 0.075},
     "unseen": "free",
     "pregrasp_distance": 0.08,
     "frame_convention": "panda",
@@ -249,7 +251,12 @@ def test_the_documentation_covers_bodies_options_and_problems(http: httpx.Client
         "application/json",
         "application/octet-stream",
         "application/x-npy",
+        "multipart/form-data",
     }
+    assert set(post["responses"]["200"]["content"]) == {"application/json", "application/x-npz"}
+    form = post["requestBody"]["content"]["multipart/form-data"]["schema"]["properties"]
+    assert set(form) == {"cloud", "depth", "mask", "options"}
+    assert set(document["components"]["schemas"]["DepthOptions"]["properties"]) == set(DepthOptions.model_fields)
     assert set(post["responses"]) == {"200", "400", "401", "406", "413", "415", "422", "429", "503", "504"}
     assert all(
         "application/problem+json" in response["content"]

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import itertools
 import json
 from typing import Any
 
@@ -10,10 +11,20 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service import payloads
-from service.errors import Invalid, ServiceError, TooLarge
-from service.payloads import build_query, decode_json, parse_options, parse_query_string
-from tesnet.query import GraspQuery
+from service.errors import Invalid, ServiceError
+from service.payloads import (
+    CONTENT_TYPES,
+    Payload,
+    build_query,
+    decoder_for,
+    json_body,
+    parse_options,
+    parse_query_string,
+)
+from service.payloads.json_body import decode_json
+from tesnet.errors import TesnetError, TooManyPoints
+from tesnet.geometry import Gripper
+from tesnet.query import Box, GraspQuery
 
 coordinates = st.floats(-10, 10, width=32) | st.integers(-10, 10)
 clouds = st.lists(st.tuples(coordinates, coordinates, coordinates), max_size=40)
@@ -25,7 +36,7 @@ def test_json_points_are_the_same_however_they_are_cut(
     cloud: list[tuple[float, float, float]], layout: tuple[str, str], chunk: int
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(payloads, "_CHUNK", chunk)
+        patch.setattr(json_body, "_CHUNK", chunk)
         body = bytearray(json.dumps({"seed": 1, "points": cloud, "up": [0, 0, 1]}, separators=layout).encode())
         payload = decode_json(body, 1000)
     np.testing.assert_array_equal(payload.points, np.array(cloud, np.float32).reshape(-1, 3))
@@ -48,7 +59,7 @@ def test_json_that_is_no_cloud_is_refused_however_it_is_cut(points: Any, chunk: 
     )
     body = bytearray(json.dumps({"points": points}).encode())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(payloads, "_CHUNK", chunk)
+        patch.setattr(json_body, "_CHUNK", chunk)
         if triples:
             assert len(decode_json(body, 1000).points) == len(points)
         else:
@@ -58,17 +69,29 @@ def test_json_that_is_no_cloud_is_refused_however_it_is_cut(points: Any, chunk: 
 
 @given(st.binary(max_size=200))
 def test_random_bytes_raise_nothing_but_what_the_table_of_problems_knows(body: bytes) -> None:
-    for decode in payloads.DECODERS.values():
-        for prefix in (b"", b'{"points": [[', b"\x93NUMPY\x01\x00", b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', "):
+    part = b'--b\r\nContent-Disposition: form-data; name="cloud"\r\n\r\n'
+    prefixes = (
+        b"",
+        b'{"points": [[',
+        b"\x93NUMPY\x01\x00",
+        b"\x93NUMPY\x01\x00v\x00{'descr': '<f4', ",
+        b"--b\r\n",
+        part,
+        part + b"ply\n",
+        part + b"FIELDS x y z\n",
+    )
+    for kind in CONTENT_TYPES:
+        decode = decoder_for(f"{kind}; boundary=b")
+        for prefix, suffix in itertools.product(prefixes, (b"", b"\r\n--b--\r\n")):
             try:
-                payload = decode(bytearray(prefix + body), 1000)
-            except ServiceError:
+                payload = decode(bytearray(prefix + body + suffix), 1000)
+            except (ServiceError, TesnetError):
                 continue
             assert payload.points.shape[1:] == (3,)
 
 
 def test_a_bad_point_is_counted_from_the_start_of_the_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(payloads, "_CHUNK", 20)
+    monkeypatch.setattr(json_body, "_CHUNK", 20)
     points: list[Any] = [[0, 0, 1]] * 50
     points[37] = [0, 0, None]
     with pytest.raises(Invalid, match="point 37"):
@@ -76,9 +99,9 @@ def test_a_bad_point_is_counted_from_the_start_of_the_cloud(monkeypatch: pytest.
 
 
 def test_decoding_stops_at_the_first_point_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(payloads, "_CHUNK", 20)
+    monkeypatch.setattr(json_body, "_CHUNK", 20)
     body = bytearray(b'{"points": [' + b"[0,0,1]," * 100 + b"null]}")
-    with pytest.raises(TooLarge, match="limit"):
+    with pytest.raises(TooManyPoints, match="limit"):
         decode_json(body, 10)
 
 
@@ -97,7 +120,7 @@ def test_query_strings_hold_json_and_plain_words() -> None:
 
 def test_options_arrive_in_the_query_and_defaults_are_the_library_s_own() -> None:
     points = np.zeros((4, 3), np.float32)
-    default, library = build_query(points, parse_options({})), GraspQuery(points)
+    default, library = build_query(Payload(points), parse_options({})), GraspQuery(points)
     for name in GraspQuery.__slots__:
         if name != "points":
             assert getattr(default, name) == getattr(library, name), name
@@ -113,10 +136,12 @@ def test_options_arrive_in_the_query_and_defaults_are_the_library_s_own() -> Non
         "min_separation": b'{"rotation_deg": 40}',
         "num_approach_points": b"8",
         "max_candidates": b"99",
+        "target": b'{"box": {"min": [0, 0, 0], "max": [1, 1, 1]}}',
+        "gripper": b'{"max_width": 0.05, "finger_thickness": 0.01}',
         "unseen": b'"occupied"',
         "seed": b"5",
     }
-    query = build_query(points, parse_options(raw))
+    query = build_query(Payload(points), parse_options(raw))
     assert query.viewpoints is not None
     assert query.viewpoints.tolist() == [[0, 0, 1], [1, 0, 1]]
     assert query.up is not None
@@ -128,3 +153,6 @@ def test_options_arrive_in_the_query_and_defaults_are_the_library_s_own() -> Non
     assert (query.support_height, query.max_grasps, query.min_score) == (0.25, 3, 0.5)
     assert (query.separation_translation, query.separation_rotation_deg) == (0.01, 40)
     assert (query.num_approach_points, query.max_candidates, query.unseen, query.seed) == (8, 99, "occupied", 5)
+    assert isinstance(query.target, Box)
+    assert (query.target.maximum.tolist(), query.target.field) == ([1, 1, 1], "target")
+    assert query.gripper == Gripper(max_width=0.05, finger_thickness=0.01, finger_tip_thickness=0.01)

@@ -199,7 +199,8 @@ def test_every_pair_is_a_candidate_or_counted_as_rejected() -> None:
     assert len(coarse()) < 1024
     found, rejected = every_candidate(approach=ApproachCone(-UP, 60.0))
     pairs, none = every_candidate(CandidateConfig(max_upward=2.0, support_clearance=-1.0))
-    assert set(rejected) == {"support", "from_below", "approach"}
+    assert set(rejected) == {"support", "from_below", "approach", "target"}
+    assert rejected.pop("target") == 0
     assert min(rejected.values()) > 0
     assert none == dict.fromkeys(rejected, 0)
     assert len(found) + sum(rejected.values()) == len(pairs) < 20_000

@@ -1,0 +1,152 @@
+"""`multipart/form-data`: a cloud file, or a depth image with an optional mask; and options."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from typing import cast
+
+import msgspec
+from python_multipart.exceptions import FormParserError
+from python_multipart.multipart import MultipartParser, parse_options_header
+
+from service.errors import Invalid, Undecodable, shortened
+from service.payloads.depth_image import decode_depth
+from service.payloads.json_body import object_error
+from service.payloads.npy_body import MAGIC, decode_npy
+from service.payloads.options import json_text, merged, option_texts, raw_object, raw_values, unknown_option
+from service.payloads.payload import Payload, as_float32, refuse_empty
+from service.schemas import DepthCamera, DepthOptions
+from tesnet import formats
+
+FILES = ("cloud", "depth", "mask")
+PARTS = frozenset((*FILES, "options", *DepthOptions.model_fields))
+"""Each option may also be a part of its own."""
+
+_OPTIONS = raw_object(DepthOptions.model_fields)
+
+
+def decode_multipart(boundary: bytes, body: bytearray, max_points: int) -> Payload:
+    """The cloud of a form. Each option stands in the part `options`, a JSON object, or is a part of its own."""
+    refuse_empty(body)
+    parts = _split(boundary, body)
+    options = _part_options(parts)
+    camera = {name: options.pop(name) for name in DepthCamera.model_fields if name in options}
+    given = [name for name in ("cloud", "depth") if name in parts]
+    if len(given) != 1:
+        what = "is missing" if not given else "is given beside `depth`"
+        raise Invalid("cloud", f"{what}; send one file, `cloud` (.npy, .ply, .pcd) or `depth` (16-bit PNG)")
+    if "depth" in parts:
+        return decode_depth(parts["depth"], parts.get("mask"), camera, options, max_points)
+    if "mask" in parts:
+        raise Invalid("mask", "belongs to a depth image; with a cloud give `target`")
+    if camera:
+        raise Invalid(next(iter(camera)), "belongs to a depth image; send a file `depth`, or leave it out")
+    return _decode_cloud(parts["cloud"], options, max_points)
+
+
+def _decode_cloud(file: memoryview, options: Mapping[str, bytes], max_points: int) -> Payload:
+    """The points of a file, whose first bytes tell its format; what it is called does not matter."""
+    refuse_empty(file, "file `cloud`")
+    if bytes(file[: len(MAGIC)]) == MAGIC:
+        return Payload(decode_npy(file, max_points).points, options)
+    if formats.is_ply(file):
+        return Payload(as_float32(formats.read_ply(file, max_points)), options)
+    if formats.is_pcd(file):
+        rows = formats.read_pcd(file, max_points)
+        is_point = formats.seen(rows)
+        return Payload(as_float32(rows[is_point]), options, is_point)
+    raise Undecodable("The file `cloud` begins like none of .npy, .ply and .pcd; send one of them.")
+
+
+def _part_options(parts: Mapping[str, memoryview]) -> dict[str, bytes]:
+    options: Mapping[str, bytes] = {}
+    if "options" in parts:
+        text = bytes(parts["options"])
+        try:
+            options = option_texts(raw_values(_OPTIONS.decode(text)))
+        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            raise object_error(text, error, 'for example {"up": [0, 0, 1]}', "options") from None
+    alone = {name: json_text(name, bytes(part)) for name, part in parts.items() if name not in (*FILES, "options")}
+    return dict(merged(options, alone))
+
+
+# --------------------------------------------------------------------------------------------------------------- parts
+
+
+def _split(boundary: bytes, body: bytearray) -> dict[str, memoryview]:
+    """The parts by name, without a copy.
+
+    Raises:
+        Undecodable: cut off, or no form.
+        Invalid: an unknown part, or one that is given twice.
+    """
+    form = _Form(memoryview(body))
+    parser = MultipartParser(
+        boundary,
+        {
+            "on_part_begin": form.begin_part,
+            "on_header_field": form.add_header_name,
+            "on_header_value": form.add_header_value,
+            "on_header_end": form.end_header,
+            "on_headers_finished": form.check_name,
+            "on_part_data": form.add_content,
+            "on_part_end": form.end_part,
+            "on_end": form.end,
+        },
+    )
+    try:
+        parser.write(cast("bytes", body))  # it only slices and searches
+    except FormParserError as error:
+        raise Undecodable(f"The form cannot be read: {shortened(str(error))}.") from None
+    if not form.complete:
+        raise Undecodable("The form does not end with its boundary; it was cut off, or the boundary is another one.")
+    return form.parts
+
+
+class _Form:
+    """What the parser calls: gathers names, and where each part's content lies in the body."""
+
+    def __init__(self, body: memoryview) -> None:
+        self.parts: dict[str, memoryview] = {}
+        self.complete = False
+        self._body = body
+        self.begin_part()
+
+    def begin_part(self) -> None:
+        self._header_name = bytearray()
+        self._header_value = bytearray()
+        self._name = ""
+        self._start: int | None = None
+        self._end = 0
+
+    def add_header_name(self, data: bytes, start: int, end: int) -> None:
+        self._header_name += data[start:end]
+
+    def add_header_value(self, data: bytes, start: int, end: int) -> None:
+        self._header_value += data[start:end]
+
+    def end_header(self) -> None:
+        if self._header_name.lower() == b"content-disposition":
+            _, parameters = parse_options_header(bytes(self._header_value))
+            self._name = parameters.get(b"name", b"").decode("utf-8", "replace")
+        self._header_name.clear()
+        self._header_value.clear()
+
+    def check_name(self) -> None:
+        if not self._name:
+            raise Undecodable("A part of the form has no name in a Content-Disposition header.")
+        if self._name in self.parts:
+            raise Invalid(shortened(self._name), "is given twice in the form; give it once")
+        if self._name not in PARTS:
+            raise unknown_option(self._name)
+
+    def add_content(self, _: bytes, start: int, end: int) -> None:
+        if self._start is None:
+            self._start = start
+        self._end = end
+
+    def end_part(self) -> None:
+        self.parts[self._name] = self._body[self._start or 0 : self._end]
+
+    def end(self) -> None:
+        self.complete = True

@@ -1,0 +1,238 @@
+"""Options, from the text of query strings, JSON bodies and forms to checked values."""
+
+from __future__ import annotations
+
+import array
+import difflib
+import re
+from collections.abc import Iterable, Iterator
+from typing import TYPE_CHECKING, TypeVar
+from urllib.parse import unquote_to_bytes
+
+import msgspec
+from pydantic import BaseModel, ValidationError
+
+from service.errors import Invalid, Undecodable, shortened
+from service.payloads.payload import RawOptions
+from service.schemas import DepthCamera, GraspOptions, Target
+
+if TYPE_CHECKING:
+    from collections.abc import Mapping
+
+Model = TypeVar("Model", bound=BaseModel)
+
+MAX_OPTIONS_BYTES = 65_536
+"""JSON text of all options together, but for a target's indices."""
+
+_CHUNK = 1 << 17
+"""Bytes of indices decoded in one go: a few milliseconds."""
+
+NOT_UTF8 = "The JSON is not UTF-8; encode it so."
+
+
+def parse_query_string(query_string: bytes) -> RawOptions:
+    """Options of a URL: each value is URL-encoded JSON, a plain word needs no quotes.
+
+    Raises:
+        Invalid: a name that occurs twice, a value that is neither JSON nor a plain word.
+    """
+    options: dict[str, bytes] = {}
+    for pair in filter(None, query_string.split(b"&")):
+        raw_name, _, raw_value = pair.replace(b"+", b" ").partition(b"=")
+        name = unquote_to_bytes(raw_name).decode("utf-8", "replace")
+        if name in options:
+            raise Invalid(shortened(name), "is given twice in the query string; give it once")
+        if name == "points":
+            raise Invalid(name, "is no option of the query string; points are the body")
+        options[name] = json_text(name, unquote_to_bytes(raw_value))
+    return options
+
+
+def merged(first: RawOptions, second: RawOptions) -> RawOptions:
+    """Options of query string and body together.
+
+    Raises:
+        Invalid: one given in both.
+    """
+    for name in first.keys() & second.keys():
+        raise Invalid(name, "is given in the query string and in the body, or twice there; give it once")
+    return {**first, **second}
+
+
+def parse_options(raw: RawOptions, max_indices: int | None = None) -> GraspOptions:
+    """Checked options. A null counts as not given.
+
+    Args:
+        raw: their JSON text.
+        max_indices: how many indices a target may have; None: as many as fit into the bytes that all options may have.
+
+    Raises:
+        Invalid: an unknown name, a value of the wrong type or out of range; the message says what is expected.
+    """
+    for name in raw:
+        if name not in GraspOptions.model_fields:
+            raise unknown_option(name)
+    if max_indices is None or len(raw.get("target", b"")) <= _CHUNK // 16:
+        return checked(GraspOptions, raw)
+    options = checked(GraspOptions, {name: value for name, value in raw.items() if name != "target"})
+    return options.model_copy(update={"target": _many_indices(raw["target"], max_indices)})
+
+
+def checked(model: type[Model], raw: RawOptions) -> Model:
+    """A model of options from their JSON text, whose names it is known to have. A null counts as not given.
+
+    Raises:
+        Invalid: names the option and says what is expected.
+    """
+    given = {name: value for name, value in raw.items() if value != b"null"}
+    size = sum(map(len, given.values()))
+    if size > MAX_OPTIONS_BYTES:
+        largest = max(given, key=lambda name: len(given[name]))
+        raise Invalid(largest, f"is too long: the options have {size} bytes (limit {MAX_OPTIONS_BYTES}); shorten them")
+    text = b"{" + b",".join(b'"%b":%b' % (name.encode(), value) for name, value in given.items()) + b"}"
+    try:
+        return model.model_validate_json(text)
+    except ValidationError as error:
+        raise _invalid_option(model, error, given) from None
+
+
+def raw_object(names: Iterable[str]) -> msgspec.json.Decoder[msgspec.Struct]:
+    """A decoder of JSON objects that finds the extents of the values with these names.
+
+    It neither builds Python objects for them nor goes on after the first unknown name.
+    """
+    fields = [(name, msgspec.Raw | msgspec.UnsetType, msgspec.UNSET) for name in names]
+    return msgspec.json.Decoder(msgspec.defstruct("RawObject", fields, forbid_unknown_fields=True))
+
+
+def raw_values(found: msgspec.Struct) -> dict[str, memoryview]:
+    """The JSON text of each value that a `raw_object` has found."""
+    return {name: memoryview(raw) for name, raw in msgspec.structs.asdict(found).items() if raw is not msgspec.UNSET}
+
+
+def option_texts(values: Mapping[str, memoryview]) -> dict[str, bytes]:
+    """The values' JSON text.
+
+    Raises:
+        Undecodable: not UTF-8.
+    """
+    texts = {name: bytes(value) for name, value in values.items()}
+    if not all(map(_is_utf8, texts.values())):
+        raise Undecodable(NOT_UTF8)
+    return texts
+
+
+def json_text(name: str, value: bytes) -> bytes:
+    """A value of a URL or of a form as JSON text: it is JSON, or a plain word.
+
+    Raises:
+        Invalid: neither.
+    """
+    if is_json(value):
+        return value.strip()
+    if re.fullmatch(rb"[A-Za-z][\w.-]*", value):
+        return b'"%b"' % value
+    text = shortened(value[:400].decode("utf-8", "replace")) or "empty"
+    raise Invalid(
+        shortened(name), f"is {text}, neither JSON nor a plain word; URL-encode JSON, for example [0.3,0,0.6]"
+    )
+
+
+def is_json(text: bytes) -> bool:
+    """Whether this is a JSON document in UTF-8."""
+    try:
+        msgspec.json.decode(text, type=msgspec.Raw)
+    except (msgspec.DecodeError, RecursionError):
+        return False
+    return _is_utf8(text)
+
+
+def _is_utf8(text: bytes) -> bool:
+    try:
+        text.decode("utf-8")
+    except UnicodeDecodeError:
+        return False
+    return True
+
+
+def unknown_option(name: str) -> Invalid:
+    """The problem with a name that no option has."""
+    if name in DepthCamera.model_fields:
+        return Invalid(
+            name, "belongs to a depth image: send a form with a file `depth`, and this in its part `options`"
+        )
+    known = list(GraspOptions.model_fields)
+    close = difflib.get_close_matches(name[:64], known, 1)
+    hint = f"did you mean {close[0]}? " if close else ""
+    return Invalid(shortened(name), f"is no option; {hint}valid: {', '.join(known)}")
+
+
+_UNIONS = frozenset({"viewpoint", "support_height"})
+"""Options of several types, whose names pydantic puts into an error's location."""
+
+
+def _invalid_option(model: type[BaseModel], error: ValidationError, given: RawOptions) -> Invalid:
+    first = error.errors(include_url=False, include_input=False)[0]
+    if not first["loc"]:
+        return Invalid(next(iter(given)), f"or another option cannot be read: {shortened(first['msg'])}")
+    name, *inside = first["loc"]
+    field = str(name)
+    path = [str(part) for part in inside if field not in _UNIONS]
+    where = f" (at {'.'.join(path)})" if path else ""
+    what = first["msg"][:1].lower() + first["msg"][1:]
+    expected = model.model_fields[field].description
+    if first["type"] == "extra_forbidden":
+        what = "there is no such name"
+    if field not in given:
+        return Invalid(field, f"is missing. Expected: {expected}")
+    value = shortened(given[field][:400].decode("utf-8", "replace"))
+    return Invalid(field, f"is {value}: {what}{where}. Expected: {expected}")
+
+
+# ------------------------------------------------------------------------------------------------- a target of indices
+
+_TARGET = raw_object(Target.model_fields)
+_INDICES = msgspec.json.Decoder(list[int])
+
+
+def _many_indices(text: bytes, max_indices: int) -> Target | None:
+    """A target that has so many indices that pydantic would keep the interpreter's lock for long.
+
+    Raises:
+        Invalid: no list of whole numbers from 0 on, or more than the limit.
+    """
+    try:
+        values = raw_values(_TARGET.decode(text))
+    except msgspec.DecodeError:
+        raise Invalid(
+            "target", f"cannot be read. Expected: {GraspOptions.model_fields['target'].description}"
+        ) from None
+    written = bytes(values.get("indices", b"")).strip()
+    if "box" in values or not written.startswith(b"["):
+        return checked(GraspOptions, {"target": text}).target
+    indices = array.array("q")
+    try:
+        for chunk in _chunks(written):
+            numbers = _INDICES.decode(chunk)
+            indices.extend(numbers)
+            if min(numbers, default=0) < 0:
+                raise Invalid("target", "has a negative index; count the posted points from 0")
+            if len(indices) > max_indices:
+                raise Invalid(
+                    "target", f"has more than {max_indices} indices, which is the limit of points; send fewer"
+                )
+    except (msgspec.DecodeError, OverflowError, RecursionError):
+        raise Invalid(
+            "target", f"has something else than whole numbers after {len(indices)} indices; give numbers of points"
+        ) from None
+    return Target.model_construct(box=None, indices=indices)
+
+
+def _chunks(text: bytes) -> Iterator[bytes]:
+    """A JSON array of numbers as several such arrays. What holds something else is refused when it is decoded."""
+    inside = text[1:-1]
+    start = 0
+    while (end := inside.find(b",", start + _CHUNK)) >= 0:
+        yield b"[" + inside[start:end] + b"]"
+        start = end + 1
+    yield b"[" + inside[start:] + b"]"
