@@ -17,6 +17,7 @@ from service.access import AccessMiddleware
 from service.batching import PredictionWorker, PredictorFactory
 from service.errors import NotReady, ServiceError, problem_response
 from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
+from service.inference_protocol import inference_protocol
 from service.metrics import Metrics
 from service.middleware import RequestMiddleware
 from service.openapi import document_grasps, problems
@@ -79,13 +80,14 @@ def create_app(
             allow_methods=["GET", "POST"],
             allow_headers=[
                 "Accept",
+                "Inference-Header-Content-Length",
                 "Authorization",
                 "Content-Type",
                 "X-API-Key",
                 "X-Request-ID",
                 "X-Request-Timeout",
             ],
-            expose_headers=["Retry-After", "X-Request-ID"],
+            expose_headers=["Inference-Header-Content-Length", "Retry-After", "X-Request-ID"],
         )
     app.add_middleware(RequestMiddleware, metrics=metrics)
     for kind in (ServiceError, InvalidQuery, TooManyPoints, UnreadableFile, HTTPException):
@@ -99,8 +101,7 @@ def create_app(
 
     @app.get("/health/live", tags=["health"], summary="Does the process work?", responses=problems(NotReady))
     async def live() -> schemas.Health:
-        if worker.state == "failed":
-            raise NotReady("The predictor could not be loaded; the log says why.", retry_after=60)
+        worker.check_live()
         return schemas.Health(status="live")
 
     @app.get("/health/ready", tags=["health"], summary="Does the service take requests?", responses=problems(NotReady))
@@ -116,6 +117,7 @@ def create_app(
     async def metrics_text() -> Response:
         return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
+    app.include_router(inference_protocol(settings, worker, endpoint))
     document_grasps(app)
     return app
 

@@ -169,6 +169,15 @@ class PredictionWorker:
         self._thread.join(timeout)
         return not self._thread.is_alive()
 
+    def check_live(self) -> None:
+        """Whether queries are taken, or will be.
+
+        Raises:
+            NotReady: the predictor could not be made.
+        """
+        if self._state == "failed":
+            raise NotReady("The predictor could not be loaded; the log says why.", retry_after=60)
+
     def check_ready(self) -> None:
         """Whether queries are taken.
 

@@ -30,7 +30,7 @@ from service.errors import (
 from service.intake import Intake
 from service.metrics import Metrics
 from service.middleware import RequestRecord
-from service.payloads import Decoder, build_query, decoder_for, merged, parse_options, parse_query_string
+from service.payloads import build_query, decoder_for, merged, parse_options, parse_query_string
 from service.schemas import GraspOptions
 from service.settings import Settings
 from tesnet.query import GraspQuery
@@ -180,7 +180,8 @@ class GraspEndpoint:
         Raises:
             UnknownContentType, NotAcceptable, Invalid: what the head alone shows to be wrong.
         """
-        decode = decoder_of(request)
+        refuse_compressed(request)
+        decode = decoder_for(request.headers.get("content-type", ""))
         encoder = encoder_for(request.headers.getlist("accept"))
         url_options = parse_query_string(request.scope["query_string"])
         parse_options(url_options)  # refuse a bad one before the body is read
@@ -242,19 +243,13 @@ class GraspEndpoint:
         return seconds
 
 
-def decoder_of(request: Request) -> Decoder:
-    """The decoder for the request's body.
-
-    Raises:
-        UnknownContentType: there is none.
-        Undecodable: a form without a boundary.
-    """
+def refuse_compressed(request: Request) -> None:
+    """Raise `UnknownContentType` for a body that would have to be expanded."""
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
         raise UnknownContentType(
             f"Content-Encoding {shortened(encoding)} is not supported; send the body uncompressed."
         )
-    return decoder_for(request.headers.get("content-type", ""))
 
 
 def check_model(options: GraspOptions, loaded: ModelInfo) -> None:
