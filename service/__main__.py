@@ -8,6 +8,7 @@ import errno
 import logging
 import math
 import os
+import resource
 import signal
 import socket
 import sys
@@ -20,6 +21,7 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from service.logs import configure_logging
+from service.protocol import PunctualProtocol
 from service.settings import InvalidSetting, Settings, load_settings, service_version, unknown_variables, variables
 
 if TYPE_CHECKING:
@@ -30,6 +32,9 @@ log = logging.getLogger("service")
 
 KEEP_ALIVE_SECONDS = 65
 """Longer than the minute after which common proxies drop idle connections, so that the proxy closes first."""
+LAST_BYTES_SECONDS = 2
+"""For answers on their way when draining has ended."""
+MAX_OPEN_FILES = 65_536
 
 
 def main() -> int:
@@ -39,6 +44,7 @@ def main() -> int:
     """
     _parser().parse_args()
     started = time.perf_counter()
+    _allow_many_connections()
     try:
         settings = load_settings(os.environ)
         listener = _listen(settings)
@@ -47,7 +53,9 @@ def main() -> int:
     configure_logging(settings.log_level)
     for name, close in unknown_variables(os.environ).items():
         log.warning("unknown setting %s is ignored%s", name, f"; did you mean {close}?" if close else "")
-    return _serve(settings, listener, started)
+    code = _serve(settings, listener, started)
+    logging.shutdown()
+    return code
 
 
 def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
@@ -77,12 +85,13 @@ def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
     app = create_app(settings, _predictor_factory(settings), on_ready, on_failure)
     config = uvicorn.Config(
         app,
+        http=PunctualProtocol,
         log_config=None,
         access_log=False,
         ws="none",
         server_header=False,
         timeout_keep_alive=KEEP_ALIVE_SECONDS,
-        timeout_graceful_shutdown=max(1, round(settings.drain_timeout)),
+        timeout_graceful_shutdown=LAST_BYTES_SECONDS,
     )
     server = _Server(config, app.state.endpoint, settings.drain_timeout)
     log.info("listening", extra={"fields": {"url": url, "port": port, "pid": os.getpid()}})
@@ -90,7 +99,18 @@ def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
     if failures:
         return _fail_loading(failures[0])
     log.info("stopped")
+    if not app.state.endpoint.closed:  # a prediction still runs: the interpreter could not end in order
+        logging.shutdown()
+        os._exit(0)
     return 0
+
+
+def _allow_many_connections() -> None:
+    """Raise the limit of open files, each connection being one, as far as this user may."""
+    soft, hard = resource.getrlimit(resource.RLIMIT_NOFILE)
+    wanted = MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_OPEN_FILES)
+    if soft != resource.RLIM_INFINITY and soft < wanted:
+        resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
 
 
 def _predictor_factory(settings: Settings) -> PredictorFactory:
@@ -197,7 +217,9 @@ def _parser() -> argparse.ArgumentParser:
     lines = []
     for name, field in variables().items():
         described = Settings.model_fields[field]
-        default = "" if described.default_factory or described.default is None else f" Default: {described.default}."
+        default = (
+            "" if described.default_factory or described.default in (None, ()) else f" Default: {described.default}."
+        )
         lines.append(
             textwrap.fill(
                 f"{described.description}{default}", 110, initial_indent=f"  {name:<22} ", subsequent_indent=" " * 25

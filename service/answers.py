@@ -74,20 +74,29 @@ def encode_npz(
     result: GraspResult, options: GraspOptions, model: ModelInfo, timings_ms: Mapping[str, float], request_id: str
 ) -> bytes:
     """A .npz of one array a field, rows being grasps; `meta` is the rest of the JSON document, as text."""
-    grasps = result.grasps
     file = io.BytesIO()
-    np.savez(
-        file,
-        scores=grasps.scores,
-        poses=grasps.in_convention(options.frame_convention),
-        hand_poses=grasps.hand_poses,
-        pregrasps=grasps.pregrasps(options.pregrasp_distance),
-        widths=grasps.widths,
-        approach_points=grasps.approach_points,
-        contact_points=grasps.contact_points,
-        meta=np.array(msgspec.json.encode(_meta(result, model, timings_ms, request_id)).decode()),
-    )
+    meta = answer_meta(result, model, timings_ms, request_id)
+    np.savez(file, allow_pickle=False, meta=np.array(meta.decode()), **answer_arrays(result, options))
     return file.getvalue()
+
+
+def answer_arrays(result: GraspResult, options: GraspOptions) -> dict[str, NDArray[np.float64]]:
+    """The grasps as arrays by name, rows being grasps."""
+    grasps = result.grasps
+    return {
+        "scores": grasps.scores,
+        "poses": grasps.in_convention(options.frame_convention),
+        "hand_poses": grasps.hand_poses,
+        "pregrasps": grasps.pregrasps(options.pregrasp_distance),
+        "widths": grasps.widths,
+        "approach_points": grasps.approach_points,
+        "contact_points": grasps.contact_points,
+    }
+
+
+def answer_meta(result: GraspResult, model: ModelInfo, timings_ms: Mapping[str, float], request_id: str) -> bytes:
+    """Everything but the grasps, as JSON."""
+    return msgspec.json.encode(_meta(result, model, timings_ms, request_id))
 
 
 ENCODERS = (Encoder(JSON, encode_json), Encoder(NPZ, encode_npz))

@@ -10,11 +10,14 @@ import msgspec
 from fastapi import FastAPI, Request, Response
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
+from starlette.middleware.cors import CORSMiddleware
 
 from service import schemas
+from service.access import AccessMiddleware
 from service.batching import PredictionWorker, PredictorFactory
 from service.errors import NotReady, ServiceError, problem_response
 from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
+from service.inference_protocol import inference_protocol
 from service.metrics import Metrics
 from service.middleware import RequestMiddleware
 from service.openapi import document_grasps, problems
@@ -27,6 +30,9 @@ from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
 DESCRIPTION = """Point cloud in, ranked SE(3) grasps out. Lengths are metres; poses are in the frame of the request's
 points. In the default `panda` convention a grasp's origin is the TCP, +z is the direction of travel and +y the closing
 direction."""
+
+STOP_SECONDS = 2.0
+"""For a prediction that still runs when the application ends; its thread is left behind after that."""
 
 
 def create_app(
@@ -44,15 +50,17 @@ def create_app(
         on_failure: called there with the exception when the predictor cannot be made.
     """
     metrics = Metrics()
-    worker = PredictionWorker(predictor_factory, settings.queue_size, metrics.batch, on_ready, on_failure)
+    worker = PredictionWorker(
+        predictor_factory, settings.queue_size, settings.max_batch, metrics.batch, on_ready, on_failure
+    )
     endpoint = GraspEndpoint(settings, worker, metrics)
-    metrics.watch(queue_depth=lambda: worker.depth, is_ready=lambda: endpoint.ready)
+    metrics.watch(queue_depth=lambda: worker.depth, active=lambda: endpoint.active, is_ready=lambda: endpoint.ready)
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
         worker.start()
         yield
-        await anyio.to_thread.run_sync(worker.stop)
+        await anyio.to_thread.run_sync(endpoint.close, STOP_SECONDS)
 
     app = FastAPI(
         title="TES-Net grasp service",
@@ -63,6 +71,24 @@ def create_app(
         redirect_slashes=False,
     )
     app.state.endpoint = endpoint
+    if settings.api_keys:
+        app.add_middleware(AccessMiddleware, keys=[key.get_secret_value() for key in settings.api_keys])
+    if settings.cors_origins:  # outside: a browser asks for permission without a key
+        app.add_middleware(
+            CORSMiddleware,
+            allow_origins=settings.cors_origins,
+            allow_methods=["GET", "POST"],
+            allow_headers=[
+                "Accept",
+                "Inference-Header-Content-Length",
+                "Authorization",
+                "Content-Type",
+                "X-API-Key",
+                "X-Request-ID",
+                "X-Request-Timeout",
+            ],
+            expose_headers=["Inference-Header-Content-Length", "Retry-After", "X-Request-ID"],
+        )
     app.add_middleware(RequestMiddleware, metrics=metrics)
     for kind in (ServiceError, InvalidQuery, TooManyPoints, UnreadableFile, HTTPException):
         app.add_exception_handler(kind, _answer_problem)
@@ -71,12 +97,11 @@ def create_app(
         "/grasps", tags=["grasps"], summary="Grasps for a point cloud", response_class=Response, include_in_schema=True
     )
     async def grasps(request: Request) -> Response:
-        return await endpoint.answer(request)
+        return await endpoint.answer(request, endpoint.reader)
 
     @app.get("/health/live", tags=["health"], summary="Does the process work?", responses=problems(NotReady))
     async def live() -> schemas.Health:
-        if worker.state == "failed":
-            raise NotReady("The predictor could not be loaded; the log says why.", retry_after=60)
+        worker.check_live()
         return schemas.Health(status="live")
 
     @app.get("/health/ready", tags=["health"], summary="Does the service take requests?", responses=problems(NotReady))
@@ -92,6 +117,7 @@ def create_app(
     async def metrics_text() -> Response:
         return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
+    app.include_router(inference_protocol(settings, worker, endpoint))
     document_grasps(app)
     return app
 
@@ -131,4 +157,4 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
 
 
 async def _answer_problem(request: Request, error: Exception) -> Response:
-    return problem_response(error, request.state.record.request_id)
+    return problem_response(error, request.scope)

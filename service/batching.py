@@ -1,21 +1,23 @@
 """One worker thread that owns the predictor, behind a bounded queue. Knows neither HTTP nor the event loop.
 
-The predictor is made, warmed up and used in the worker's thread only. A request is a `concurrent.futures.Future`:
-whoever waits for it may cancel it while it is queued, and its place is free again at once.
+The predictor is made, warmed up and used in the worker's thread only. It predicts together what waits when it is free,
+up to a limit; it never waits for more to come. A request is a `concurrent.futures.Future`: whoever waits for it may
+cancel it while it is queued, and its place is free again at once. A job whose deadline has passed is never predicted.
 """
 
 from __future__ import annotations
 
 import logging
+import math
 import threading
 import time
 from collections import deque
-from collections.abc import Callable
+from collections.abc import Callable, Sequence
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 from typing import TYPE_CHECKING, Literal, Protocol
 
-from service.errors import NotReady, QueueFull
+from service.errors import DeadlineExceeded, NotReady, QueueFull
 from tesnet.query import GraspQuery
 from tesnet.result import GraspResult
 
@@ -41,8 +43,8 @@ class Predictor(Protocol):
     def warm_up(self) -> None:
         """Predict once, so that the first request is not slow."""
 
-    def predict(self, query: GraspQuery) -> GraspResult:
-        """Grasps for a query."""
+    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[GraspResult]:
+        """The answer to each query."""
 
 
 PredictorFactory = Callable[[], Predictor]
@@ -50,19 +52,26 @@ PredictorFactory = Callable[[], Predictor]
 
 @dataclass(frozen=True, slots=True)
 class Answer:
-    """A prediction, and how long its query waited for the predictor."""
+    """A prediction, how long its query waited for the predictor, and how many were predicted together."""
 
     result: GraspResult
     queue_ms: float
+    batch_size: int
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Job:
-    """A query in the queue."""
+    """A query in the queue, with its deadline on the clock of `time.perf_counter`, which no change of date moves."""
 
     query: GraspQuery
+    deadline: float = math.inf
     future: Future[Answer] = field(default_factory=Future)
     submitted: float = field(default_factory=time.perf_counter)
+
+    def refuse(self, error: Exception) -> None:
+        """Give the waiting request an error in place of an answer, unless it has gone already."""
+        if self.future.set_running_or_notify_cancel():
+            self.future.set_exception(error)
 
 
 class PredictionWorker:
@@ -71,6 +80,7 @@ class PredictionWorker:
     Args:
         factory: makes the predictor, in the worker's thread.
         capacity: how many queries may wait.
+        max_batch: how many are predicted together.
         on_batch: told the size of every batch that is predicted.
         on_ready: told when queries are taken.
         on_failure: told the exception when the predictor cannot be made; the worker's state is `failed` then.
@@ -80,12 +90,14 @@ class PredictionWorker:
         self,
         factory: PredictorFactory,
         capacity: int,
+        max_batch: int = 1,
         on_batch: Callable[[int], None] = lambda _: None,
         on_ready: Callable[[], None] = lambda: None,
         on_failure: Callable[[BaseException], None] = lambda _: None,
     ) -> None:
         self._factory = factory
         self._capacity = capacity
+        self._max_batch = max_batch
         self._on_batch = on_batch
         self._on_ready = on_ready
         self._on_failure = on_failure
@@ -95,6 +107,7 @@ class PredictionWorker:
         self._model: ModelInfo | None = None
         self._device = ""
         self._seconds_per_job = 0.1
+        self._predicting = 0
         self._thread = threading.Thread(target=self._run, name="predictor", daemon=True)
 
     @property
@@ -124,24 +137,46 @@ class PredictionWorker:
         return len(self._jobs)
 
     @property
+    def expected_wait(self) -> float:
+        """Seconds that a query queued now would wait, judged by how long the latest ones took."""
+        return (self.depth + self._predicting) * self._seconds_per_job
+
+    @property
     def retry_after(self) -> int:
-        """Whole seconds after which a full queue should have room again."""
-        return max(1, min(60, round(self.depth * self._seconds_per_job)))
+        """Whole seconds, 1 to 60, in which a full queue should have been worked off."""
+        return max(1, min(60, math.ceil(self.expected_wait)))
 
     def start(self) -> None:
         """Start loading."""
         self._thread.start()
 
-    def stop(self) -> None:
-        """Finish what is being predicted, cancel what waits, end the thread."""
+    def stop(self, timeout: float | None = None) -> bool:
+        """Finish what is being predicted, refuse what waits, end the thread.
+
+        Args:
+            timeout: seconds to wait for the thread; None waits as long as it takes.
+
+        Returns:
+            Whether the thread has ended.
+        """
         with self._changed:
             self._state = "stopped"
             waiting = list(self._jobs)
             self._jobs.clear()
             self._changed.notify()
         for job in waiting:
-            job.future.cancel()
-        self._thread.join()
+            job.refuse(NotReady("The service ended before this request's turn; repeat it.", retry_after=1))
+        self._thread.join(timeout)
+        return not self._thread.is_alive()
+
+    def check_live(self) -> None:
+        """Whether queries are taken, or will be.
+
+        Raises:
+            NotReady: the predictor could not be made.
+        """
+        if self._state == "failed":
+            raise NotReady("The predictor could not be loaded; the log says why.", retry_after=60)
 
     def check_ready(self) -> None:
         """Whether queries are taken.
@@ -164,17 +199,28 @@ class PredictionWorker:
                 self.retry_after,
             )
 
-    def submit(self, query: GraspQuery) -> Job:
+    def submit(self, query: GraspQuery, deadline: float = math.inf) -> Job:
         """Queue a query; its future gives an `Answer`.
 
+        Args:
+            query: what is asked.
+            deadline: on the clock of `time.perf_counter`; after it the query is not predicted any more.
+
         Raises:
-            QueueFull: as many wait as may.
+            QueueFull: as many wait as may, or so many that the query's turn would come after its deadline.
             NotReady: loading, failed or stopped.
         """
         with self._changed:
             self.check_ready()
             self.check_room()
-            job = Job(query)
+            left, wait = deadline - time.perf_counter(), self.expected_wait
+            if self._jobs and wait > left:
+                raise QueueFull(
+                    f"{len(self._jobs)} requests wait, some {wait:.1f} s of work, and this one's deadline is in "
+                    f"{max(0.0, left):.1f} s; repeat it in {self.retry_after} s or with a larger X-Request-Timeout.",
+                    self.retry_after,
+                )
+            job = Job(query, deadline)
             self._jobs.append(job)
             self._changed.notify()
         return job
@@ -201,26 +247,38 @@ class PredictionWorker:
                 self._on_ready()
         while batch := self._next_batch():
             self._on_batch(len(batch))
-            for job in batch:
-                self._predict(predictor, job)
+            self._predict(predictor, batch)
 
     def _next_batch(self) -> list[Job]:
-        """The jobs to predict together, at present one; none when the worker is to end."""
+        """The jobs to predict together, at least one; none when the worker is to end."""
+        batch: list[Job] = []
         with self._changed:
-            while True:
+            self._predicting = 0
+            while not batch:
                 self._changed.wait_for(lambda: self._jobs or self._state == "stopped")
                 if self._state == "stopped":
                     return []
-                job = self._jobs.popleft()
-                if job.future.set_running_or_notify_cancel():
-                    return [job]
+                while self._jobs and len(batch) < self._max_batch:
+                    job = self._jobs.popleft()
+                    if time.perf_counter() > job.deadline:
+                        job.refuse(DeadlineExceeded("The deadline passed while the request waited for its turn."))
+                    elif job.future.set_running_or_notify_cancel():
+                        batch.append(job)
+            self._predicting = len(batch)
+        return batch
 
-    def _predict(self, predictor: Predictor, job: Job) -> None:
+    def _predict(self, predictor: Predictor, batch: list[Job]) -> None:
         started = time.perf_counter()
         try:
-            result = predictor.predict(job.query)
+            results = predictor.predict_batch([job.query for job in batch])
         except Exception as error:  # noqa: BLE001 - the waiting request raises it again
-            job.future.set_exception(error)
-        else:
-            job.future.set_result(Answer(result, 1e3 * (started - job.submitted)))
-        self._seconds_per_job += 0.2 * (time.perf_counter() - started - self._seconds_per_job)
+            if len(batch) > 1:  # each by itself, so that a query's fault is its own
+                for job in batch:
+                    self._predict(predictor, [job])
+            else:
+                batch[0].future.set_exception(error)
+            return
+        for job, result in zip(batch, results, strict=True):
+            job.future.set_result(Answer(result, 1e3 * (started - job.submitted), len(batch)))
+        taken = (time.perf_counter() - started) / len(batch)
+        self._seconds_per_job += (1 - 0.8 ** len(batch)) * (taken - self._seconds_per_job)

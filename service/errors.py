@@ -3,6 +3,8 @@
 ::
 
     ServiceError
+    +-- Unauthorized         no API key, or a wrong one
+    +-- UnknownModel         no such network or version at this path
     +-- Undecodable          the body is not what its content type says
     +-- TooLarge             more bytes or points than the limits
     +-- UnknownContentType   no decoder for the body
@@ -28,15 +30,26 @@ from http import HTTPStatus
 import msgspec
 from starlette.exceptions import HTTPException
 from starlette.responses import Response
+from starlette.types import Scope
 
 from service.schemas import Problem
 from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
 
 PROBLEM_JSON = "application/problem+json"
+INFERENCE_PROTOCOL = "/v2"
+"""Where the paths of the Open Inference Protocol begin, whose clients read a problem's `error`."""
 
 
 class ServiceError(Exception):
     """Base class of what the service refuses a request for."""
+
+
+class Unauthorized(ServiceError):
+    """An API key is wanted, and none or a wrong one came."""
+
+
+class UnknownModel(ServiceError):
+    """The path names a network, or a version of it, that is not loaded."""
 
 
 class Undecodable(ServiceError):
@@ -116,6 +129,10 @@ _INVALID = Row(
 )
 
 PROBLEMS: Mapping[type[Exception], Row] = {
+    Unauthorized: Row(
+        401, "unauthorized", "An API key is wanted", "API keys are configured, and the request has none of them"
+    ),
+    UnknownModel: Row(404, "unknown-model", "No such model", "The path names a model or version that is not loaded"),
     Undecodable: _UNDECODABLE,
     UnreadableFile: _UNDECODABLE,
     NotAcceptable: Row(
@@ -142,8 +159,13 @@ PROBLEMS: Mapping[type[Exception], Row] = {
 INTERNAL = Row(500, "internal-error", "The service failed", "A fault of the service, never of the body")
 
 
-def problem_response(error: Exception, request_id: str) -> Response:
-    """The problem document for an exception. What the table does not know is a 500 that tells no details."""
+def problem_response(error: Exception, scope: Scope) -> Response:
+    """The problem document for an exception. What the table does not know is a 500 that tells no details.
+
+    Args:
+        error: what went wrong.
+        scope: of the request, with its record.
+    """
     headers: dict[str, str] = {}
     field: str | None = None
     if isinstance(error, HTTPException):  # the router's 404 and 405
@@ -157,13 +179,16 @@ def problem_response(error: Exception, request_id: str) -> Response:
             field = error.field
         if isinstance(error, _TryLater):
             headers["Retry-After"] = str(error.retry_after)
+        if isinstance(error, Unauthorized):
+            headers["WWW-Authenticate"] = 'Bearer realm="tes-net"'
     problem = Problem(
         type=f"urn:tes-net:problem:{row.slug}",
         title=row.title,
         status=row.status,
         detail=detail,
-        request_id=request_id,
+        request_id=scope["state"]["record"].request_id,
         field=field,
+        error=detail if scope["path"].startswith(f"{INFERENCE_PROTOCOL}/") else None,
     )
     body = msgspec.json.encode(problem.model_dump(exclude_none=True))
     return Response(body, row.status, headers, media_type=PROBLEM_JSON)

@@ -1,16 +1,19 @@
-"""`POST /grasps`, from admission to answer. The event loop only waits: decoding and predicting happen in threads."""
+"""A request for grasps, from admission to answer. The event loop only waits: decoding, predicting and encoding happen
+in threads. Which bytes mean what is the business of a `ReaderFactory`: `GraspEndpoint.reader` for `POST /grasps`.
+"""
 
 from __future__ import annotations
 
 import asyncio
 import math
 import time
-from collections.abc import Callable
+from collections.abc import Callable, Mapping
+from concurrent.futures import ThreadPoolExecutor
+from dataclasses import dataclass
 from functools import partial
-from typing import Any, TypeVar
+from typing import TYPE_CHECKING, Any, TypeVar
 
 import anyio
-import anyio.to_thread
 from starlette.requests import Request
 from starlette.responses import Response
 
@@ -27,21 +30,18 @@ from service.errors import (
 from service.intake import Intake
 from service.metrics import Metrics
 from service.middleware import RequestRecord
-from service.payloads import (
-    Decoder,
-    RawOptions,
-    build_query,
-    decoder_for,
-    merged,
-    parse_options,
-    parse_query_string,
-)
+from service.payloads import build_query, decoder_for, merged, parse_options, parse_query_string
 from service.schemas import GraspOptions
 from service.settings import Settings
 from tesnet.query import GraspQuery
+from tesnet.result import GraspResult
+
+if TYPE_CHECKING:
+    from tesnet.predictor import ModelInfo
 
 MAX_TIMEOUT_S = 3600.0
-DECODER_THREADS = 2
+CODEC_THREADS = 2
+"""Bodies decoded and answers encoded at once."""
 BODIES_IN_MEMORY = 4
 """Bodies of the largest size that may be read or decoded at once; smaller ones accordingly more."""
 SMALL_ANSWER = 50
@@ -49,9 +49,26 @@ SMALL_ANSWER = 50
 
 Result = TypeVar("Result")
 
+Writer = Callable[[GraspResult, Mapping[str, float]], Response]
+"""result, milliseconds by stage -> the answer."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Asked:
+    """A decoded body: the query, and what writes its answer."""
+
+    query: GraspQuery
+    write: Writer
+
+
+Reader = Callable[[bytearray], Asked]
+"""body -> what it asks. Runs in a thread; raises what `service.errors` knows."""
+ReaderFactory = Callable[[Request], Reader]
+"""The head of a request -> the reader of its body, or an error before the body is read."""
+
 
 class GraspEndpoint:
-    """Answers `POST /grasps`, and knows how many it is answering.
+    """Answers requests for grasps, and knows how many it is answering.
 
     Args:
         settings: the limits.
@@ -64,9 +81,10 @@ class GraspEndpoint:
         self._worker = worker
         self._metrics = metrics
         self._intake = Intake(settings.max_body_bytes, BODIES_IN_MEMORY * settings.max_body_bytes)
-        self._threads: anyio.CapacityLimiter | None = None
+        self._threads = ThreadPoolExecutor(CODEC_THREADS, thread_name_prefix="codec")
         self._draining = False
         self._active = 0
+        self._closed = False
 
     @property
     def ready(self) -> bool:
@@ -77,6 +95,16 @@ class GraspEndpoint:
     def active(self) -> int:
         """Requests being answered."""
         return self._active
+
+    @property
+    def closed(self) -> bool:
+        """Whether `close` saw every prediction end."""
+        return self._closed
+
+    def close(self, timeout: float) -> None:
+        """Refuse what waits, and give a prediction that runs `timeout` seconds to end."""
+        self._threads.shutdown(wait=False, cancel_futures=True)
+        self._closed = self._worker.stop(timeout)
 
     def drain(self) -> None:
         """Take no more requests; those being answered go on."""
@@ -94,7 +122,7 @@ class GraspEndpoint:
             )
         self._worker.check_ready()
 
-    async def answer(self, request: Request) -> Response:
+    async def answer(self, request: Request, reader_of: ReaderFactory) -> Response:
         """Decode, predict, encode, within the request's deadline.
 
         Raises:
@@ -104,10 +132,11 @@ class GraspEndpoint:
         self._worker.check_room()
         record: RequestRecord = request.state.record
         timeout = self._timeout(request)
+        deadline = record.arrived + timeout
         self._active += 1
         try:
-            with anyio.fail_after(max(0.0, record.arrived + timeout - time.perf_counter())):
-                return await self._answer(request, record)
+            with anyio.fail_after(max(0.0, deadline - time.perf_counter())):
+                return await self._answer(request, record, reader_of(request), deadline)
         except TimeoutError:
             raise DeadlineExceeded(
                 f"No answer within {timeout:g} s; send fewer points, lower max_candidates, or set a larger "
@@ -116,46 +145,64 @@ class GraspEndpoint:
         finally:
             self._active -= 1
 
-    async def _answer(self, request: Request, record: RequestRecord) -> Response:
-        decode = decoder_of(request)
-        encoder = encoder_for(request.headers.getlist("accept"))
-        url_options = parse_query_string(request.scope["query_string"])
-        parse_options(url_options)  # refuse a bad one before the body is read
+    async def _answer(self, request: Request, record: RequestRecord, read: Reader, deadline: float) -> Response:
         async with self._intake.body(request) as body:
             received = time.perf_counter()
-            query, options = await self._in_thread(partial(self._decode, decode, body, url_options))
+            self._worker.check_room()  # the queue may have filled while the body arrived
+            asked = await self._in_thread(partial(read, body))
         decoded = time.perf_counter()
+        query = asked.query
         record.fields["points"] = len(query.points)
-        answer = await self._predict(request, query)
+        answer = await self._predict(request, query, deadline)
         result = answer.result
+        predicted = time.perf_counter()
         timings = {
             "decode": 1e3 * (decoded - received),
             "queue": answer.queue_ms,
             **result.timings_ms,
-            "total": 1e3 * (time.perf_counter() - received),
+            "total": 1e3 * (predicted - received),
         }
-        self._metrics.prediction(len(query.points), timings)
         record.fields.update(
             candidates=result.counts.candidates,
             returned=result.counts.returned,
             reason=result.reason,
+            batch_size=answer.batch_size,
             timings_ms={stage: round(milliseconds, 3) for stage, milliseconds in timings.items()},
         )
-        encode = partial(encoder.encode, result, options, self._worker.model, timings, record.request_id)
-        body_out = encode() if len(result.grasps) <= SMALL_ANSWER else await self._in_thread(encode)
-        return Response(body_out, media_type=encoder.content_type, headers={"Vary": "Accept"})
+        write = partial(asked.write, result, timings)
+        response = write() if len(result.grasps) <= SMALL_ANSWER else await self._in_thread(write)
+        self._metrics.prediction(len(query.points), timings | {"encode": 1e3 * (time.perf_counter() - predicted)})
+        return response
 
-    def _decode(self, decode: Decoder, body: bytearray, url_options: RawOptions) -> tuple[GraspQuery, GraspOptions]:
-        payload = decode(body, self._settings.max_points)
-        options = parse_options(merged(url_options, payload.options), self._settings.max_points)
-        loaded = self._worker.model.name
-        if options.model != loaded:
-            raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {loaded}")
-        return build_query(payload, options), options
+    def reader(self, request: Request) -> Reader:
+        """Reads the bodies of `POST /grasps`.
 
-    async def _predict(self, request: Request, query: GraspQuery) -> Answer:
+        Raises:
+            UnknownContentType, NotAcceptable, Invalid: what the head alone shows to be wrong.
+        """
+        refuse_compressed(request)
+        decode = decoder_for(request.headers.get("content-type", ""))
+        encoder = encoder_for(request.headers.getlist("accept"))
+        url_options = parse_query_string(request.scope["query_string"])
+        parse_options(url_options)  # refuse a bad one before the body is read
+        request_id = request.state.record.request_id
+
+        def read(body: bytearray) -> Asked:
+            payload = decode(body, self._settings.max_points)
+            options = parse_options(merged(url_options, payload.options), self._settings.max_points)
+            check_model(options, self._worker.model)
+
+            def write(result: GraspResult, timings_ms: Mapping[str, float]) -> Response:
+                content = encoder.encode(result, options, self._worker.model, timings_ms, request_id)
+                return Response(content, media_type=encoder.content_type, headers={"Vary": "Accept"})
+
+            return Asked(build_query(payload, options), write)
+
+        return read
+
+    async def _predict(self, request: Request, query: GraspQuery, deadline: float) -> Answer:
         """Queue the query and wait for its answer, or for the client to hang up."""
-        job = self._worker.submit(query)
+        job = self._worker.submit(query, deadline)
         answer = asyncio.wrap_future(job.future)
         gone = asyncio.ensure_future(_hung_up(request))
         either: set[asyncio.Future[Any]] = {answer, gone}
@@ -173,9 +220,8 @@ class GraspEndpoint:
             self._worker.cancel(job)
 
     async def _in_thread(self, work: Callable[[], Result]) -> Result:
-        if self._threads is None:
-            self._threads = anyio.CapacityLimiter(DECODER_THREADS)
-        return await anyio.to_thread.run_sync(work, abandon_on_cancel=True, limiter=self._threads)
+        """The result of work in one of few threads. Who stops waiting leaves it to end there: there are never more."""
+        return await asyncio.wrap_future(self._threads.submit(work))
 
     def _timeout(self, request: Request) -> float:
         """Seconds that the client gives, or the default.
@@ -197,19 +243,23 @@ class GraspEndpoint:
         return seconds
 
 
-def decoder_of(request: Request) -> Decoder:
-    """The decoder for the request's body.
-
-    Raises:
-        UnknownContentType: there is none.
-        Undecodable: a form without a boundary.
-    """
+def refuse_compressed(request: Request) -> None:
+    """Raise `UnknownContentType` for a body that would have to be expanded."""
     encoding = request.headers.get("content-encoding", "identity").strip().lower()
     if encoding != "identity":
         raise UnknownContentType(
             f"Content-Encoding {shortened(encoding)} is not supported; send the body uncompressed."
         )
-    return decoder_for(request.headers.get("content-type", ""))
+
+
+def check_model(options: GraspOptions, loaded: ModelInfo) -> None:
+    """Refuse a network that is not loaded.
+
+    Raises:
+        Invalid: names the one that is.
+    """
+    if options.model != loaded.name:
+        raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {loaded.name}")
 
 
 async def _hung_up(request: Request) -> None:

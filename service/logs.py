@@ -1,13 +1,23 @@
-"""One JSON object a log line, on standard output."""
+"""One JSON object a log line, on standard output, written by a thread of its own.
+
+A reader that has stopped, or a disk that is full, costs lines and nothing else: requests go on.
+"""
 
 from __future__ import annotations
 
 import datetime as dt
 import logging
+import os
+import queue
 import sys
+import threading
 from typing import Any
 
 import msgspec
+
+QUEUED_LINES = 10_000
+CLOSE_SECONDS = 2.0
+"""For the last lines to be written, when the process ends."""
 
 
 class JsonFormatter(logging.Formatter):
@@ -27,9 +37,61 @@ class JsonFormatter(logging.Formatter):
         return msgspec.json.encode(line, enc_hook=str).decode()
 
 
+class BackgroundHandler(logging.Handler):
+    """Writes to a file descriptor in a thread. What it cannot write is counted, and told when writing works again.
+
+    Args:
+        descriptor: of an open file or pipe.
+    """
+
+    def __init__(self, descriptor: int) -> None:
+        super().__init__()
+        self._descriptor = descriptor
+        self._lost = 0
+        self._lines: queue.Queue[str | None] = queue.Queue(QUEUED_LINES)
+        self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
+        self._thread.start()
+
+    def emit(self, record: logging.LogRecord) -> None:
+        """Queue a record's line."""
+        self._put(self.format(record))
+
+    def close(self) -> None:
+        """Write what is queued, for at most `CLOSE_SECONDS`."""
+        if self._thread.is_alive():
+            self._put(None)
+            self._thread.join(CLOSE_SECONDS)
+        super().close()
+
+    def _put(self, line: str | None) -> None:
+        try:
+            self._lines.put_nowait(line)
+        except queue.Full:
+            self._lost += 1
+
+    def _write_all(self) -> None:
+        while (line := self._lines.get()) is not None:
+            if not self._write(line):
+                self._lost += 1
+            elif self._lost:
+                lost, self._lost = self._lost, 0
+                values = {"name": __name__, "levelname": "WARNING", "msg": "log lines lost", "fields": {"lines": lost}}
+                if not self._write(self.format(logging.makeLogRecord(values))):
+                    self._lost += lost
+
+    def _write(self, line: str) -> bool:
+        rest = memoryview(f"{line}\n".encode())
+        try:
+            while rest:
+                rest = rest[os.write(self._descriptor, rest) :]
+        except OSError:
+            return False
+        return True
+
+
 def configure_logging(level: str) -> None:
     """Send every logger of the process to standard output as JSON; uvicorn's own chatter from warnings upwards."""
-    handler = logging.StreamHandler(sys.stdout)
+    handler = BackgroundHandler(sys.stdout.fileno())
     handler.setFormatter(JsonFormatter())
     logging.basicConfig(level=level.upper(), handlers=[handler], force=True)
     logging.captureWarnings(capture=True)

@@ -42,7 +42,7 @@ class Metrics:
         )
         self._stages = Histogram(
             "grasp_stage_seconds",
-            "Time of each stage of POST /grasps.",
+            "Time of each stage of a request for grasps.",
             ("stage",),
             buckets=SECONDS,
             registry=self._registry,
@@ -52,11 +52,16 @@ class Metrics:
             "grasp_batch_size", "Clouds predicted together.", buckets=BATCHES, registry=self._registry
         )
 
-    def watch(self, queue_depth: Callable[[], int], is_ready: Callable[[], bool]) -> None:
-        """Read these two whenever Prometheus asks."""
+    def watch(self, queue_depth: Callable[[], int], active: Callable[[], int], is_ready: Callable[[], bool]) -> None:
+        """Read these whenever Prometheus asks."""
         Gauge("grasp_queue_depth", "Requests that wait for the predictor.", registry=self._registry).set_function(
             queue_depth
         )
+        Gauge(
+            "grasp_active_requests",
+            "Requests for grasps that are being read, wait or are predicted.",
+            registry=self._registry,
+        ).set_function(active)
         Gauge("grasp_ready", "1 when requests are taken.", registry=self._registry).set_function(is_ready)
 
     def request(self, method: str, route: str, status: int, seconds: float) -> None:

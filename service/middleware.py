@@ -89,7 +89,7 @@ class RequestMiddleware:
             log.exception("failed", extra={"fields": {"request_id": record.request_id}})
             if record.status:
                 raise
-            await problem_response(error, record.request_id)(scope, receiving, sending)
+            await problem_response(error, scope)(scope, receiving, sending)
         finally:
             self._finish(scope, record)
 

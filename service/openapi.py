@@ -8,7 +8,7 @@ from fastapi import FastAPI
 from pydantic.json_schema import models_json_schema
 
 from service.answers import NPZ
-from service.errors import PROBLEM_JSON, PROBLEMS, ClientGone
+from service.errors import PROBLEM_JSON, PROBLEMS, ClientGone, UnknownModel
 from service.payloads import JSON, MULTIPART, NPY, OCTET_STREAM
 from service.schemas import DepthOptions, GraspOptions, GraspRequest, GraspResponse, Problem
 
@@ -119,7 +119,7 @@ def _grasps(options: dict[str, Any]) -> dict[str, Any]:
             **{
                 str(row.status): _problem(row.when, retry=row.status in (429, 503))
                 for kind, row in PROBLEMS.items()
-                if kind is not ClientGone
+                if kind not in (ClientGone, UnknownModel)
             },
         },
     }

@@ -312,6 +312,9 @@ class Problem(ResponsePart):
     detail: str = Field(description="What was found, what is allowed, and what to do.")
     request_id: str = Field(description="X-Request-ID of this request.")
     field: str | None = Field(default=None, description="The option or header at fault, where there is one.")
+    error: str | None = Field(
+        default=None, description="`detail` again, on routes of the Open Inference Protocol, whose clients read this."
+    )
 
 
 class Health(ResponsePart):
@@ -358,3 +361,29 @@ class ModelResponse(ResponsePart):
     content_types: list[str] = Field(description="Content types that `POST /grasps` decodes.")
     limits: LimitsOut
     device: str = Field(description="Compute device of the predictor.")
+
+
+class TensorMetadata(ResponsePart):
+    """A tensor of the Open Inference Protocol."""
+
+    name: str = Field(description="Its name.")
+    datatype: str = Field(description="FP32, FP64 or BYTES.")
+    shape: list[int] = Field(description="Its axes; -1 is any length.")
+
+
+class ModelMetadata(ResponsePart):
+    """Answer of `GET /v2/models/tesnet`."""
+
+    name: str = Field(description="Name of the network.")
+    versions: list[str] = Field(description="The loaded version of its weights.")
+    platform: str = Field(description="What computes it.")
+    inputs: list[TensorMetadata] = Field(description="Tensors that `infer` takes.")
+    outputs: list[TensorMetadata] = Field(description="Tensors that `infer` gives.")
+
+
+class ServerMetadata(ResponsePart):
+    """Answer of `GET /v2`."""
+
+    name: str = Field(description="Name of the server.")
+    version: str = Field(description="Version of the server.")
+    extensions: list[str] = Field(description="Extensions of the protocol that it knows.")

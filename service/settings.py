@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import difflib
+import math
 import os
 import re
 from collections.abc import Mapping
@@ -10,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
 
 PREFIX = "GRASP_"
 MAX_THREADS = 8
@@ -33,7 +34,21 @@ class InvalidSetting(Exception):
 def default_threads() -> int:
     """Cores that this process may use, at most `MAX_THREADS`."""
     cores = len(os.sched_getaffinity(0)) if hasattr(os, "sched_getaffinity") else os.cpu_count() or 1
-    return min(cores, MAX_THREADS)
+    return max(1, int(min(cores, MAX_THREADS, cpu_quota())))
+
+
+def cpu_quota(groups: Path = Path("/sys/fs/cgroup")) -> float:
+    """Cores' worth of time that the container may use, infinite without a limit.
+
+    More threads than that are all stopped for the rest of every tenth of a second once its time is used up.
+    """
+    for paths in (["cpu.max"], ["cpu/cpu.cfs_quota_us", "cpu/cpu.cfs_period_us"]):
+        try:
+            quota, period = " ".join((groups / path).read_text(encoding="ascii") for path in paths).split()
+        except (OSError, ValueError):  # another version of control groups, or none
+            continue
+        return math.inf if quota in ("max", "-1") else int(quota) / int(period)
+    return math.inf
 
 
 class Settings(BaseModel):
@@ -56,7 +71,7 @@ class Settings(BaseModel):
         default_factory=default_threads,
         ge=1,
         le=1024,
-        description=f"CPU threads of the predictor. Default: the cores, at most {MAX_THREADS}.",
+        description=f"CPU threads of the predictor. Default: the cores it may use, at most {MAX_THREADS}.",
     )
     max_points: int = Field(
         default=1_000_000, ge=1, le=100_000_000, description="Points in a request, 1 to 100,000,000."
@@ -67,14 +82,30 @@ class Settings(BaseModel):
     queue_size: int = Field(
         default=32, ge=1, le=10_000, description="Requests that may wait for the predictor, 1 to 10,000."
     )
-    max_batch: Literal[1] = Field(
-        default=1, description="Clouds predicted together; this version predicts one at a time: 1."
+    max_batch: int = Field(
+        default=1,
+        ge=1,
+        le=64,
+        description="Waiting requests predicted together, 1 to 64; more than 1 does not pay on a CPU.",
     )
     request_timeout: float = Field(
         default=30.0, gt=0, le=3600, description="Seconds to answer a request without X-Request-Timeout, at most 3600."
     )
     drain_timeout: float = Field(
-        default=30.0, ge=0, le=3600, description="Seconds to finish accepted requests after SIGTERM, 0 to 3600."
+        default=25.0,
+        ge=0,
+        le=3600,
+        description="Seconds to finish accepted requests after SIGTERM, 0 to 3600; the process ends at most 5 s later.",
+    )
+    api_keys: tuple[SecretStr, ...] = Field(
+        default=(),
+        description="Keys, separated by commas, one of which a request must bring as `Authorization: Bearer KEY` or "
+        "`X-API-Key: KEY`; printable ASCII without spaces. Default: none, everybody is answered.",
+    )
+    cors_origins: tuple[str, ...] = Field(
+        default=(),
+        description="Origins of web pages, separated by commas, whose scripts may ask (https://robot.example), or *. "
+        "Default: none.",
     )
     log_level: Literal["debug", "info", "warning", "error"] = Field(
         default="info", description="Least level of a log line: debug, info, warning or error."
@@ -85,20 +116,29 @@ class Settings(BaseModel):
     def _lower_case(cls, value: object) -> object:
         return value.strip().lower() if isinstance(value, str) else value
 
-    @field_validator("max_batch", mode="before")
+    @field_validator("api_keys", "cors_origins", mode="before")
     @classmethod
-    def _whole_number(cls, value: object) -> object:
-        return int(value) if isinstance(value, str) and re.fullmatch(r"\d{1,6}", value) else value
+    def _split(cls, value: object) -> object:
+        return [part.strip() for part in value.split(",")] if isinstance(value, str) else value
+
+    @field_validator("api_keys")
+    @classmethod
+    def _printable(cls, keys: tuple[SecretStr, ...]) -> tuple[SecretStr, ...]:
+        if not all(re.fullmatch(r"[!-~]+", key.get_secret_value()) for key in keys):
+            raise ValueError("not printable")
+        return keys
+
+    @field_validator("cors_origins")
+    @classmethod
+    def _origins(cls, origins: tuple[str, ...]) -> tuple[str, ...]:
+        if not all(re.fullmatch(r"\*|https?://[^/\s]+", origin) for origin in origins):
+            raise ValueError("no origin")
+        return origins
 
     @property
     def max_body_bytes(self) -> int:
         """Bytes in a request's body."""
         return int(self.max_body_mb * 2**20)
-
-
-REFUSED = {
-    "GRASP_API_KEYS": "this version knows no API keys and would answer everybody; unset it, and put a proxy in front"
-}
 
 
 def load_settings(environment: Mapping[str, str]) -> Settings:
@@ -107,9 +147,6 @@ def load_settings(environment: Mapping[str, str]) -> Settings:
     Raises:
         InvalidSetting: names the variable, its value and the remedy.
     """
-    for variable, why in REFUSED.items():
-        if environment.get(variable):
-            raise InvalidSetting(variable, f"is set, but {why}")
     values = {
         field: environment[variable]
         for variable, field in variables().items()
@@ -127,7 +164,8 @@ def load_settings(environment: Mapping[str, str]) -> Settings:
                 " Kubernetes sets this variable for a Service named `grasp`: give the Service another name, or set "
                 "enableServiceLinks: false."
             )
-        raise InvalidSetting(f"{PREFIX}{field.upper()}", f"is {values[field]!r}; expected: {remedy}{hint}") from None
+        value = "not usable" if field == "api_keys" else repr(values[field])  # a secret stays out of logs
+        raise InvalidSetting(f"{PREFIX}{field.upper()}", f"is {value}; expected: {remedy}{hint}") from None
 
 
 def variables() -> dict[str, str]:
@@ -138,7 +176,7 @@ def variables() -> dict[str, str]:
 def unknown_variables(environment: Mapping[str, str]) -> dict[str, str | None]:
     """`GRASP_*` variables that mean nothing, each with the closest known name."""
     known = variables()
-    unknown = [name for name in environment if name.startswith(PREFIX) and name not in known and name not in REFUSED]
+    unknown = [name for name in environment if name.startswith(PREFIX) and name not in known]
     return {name: next(iter(difflib.get_close_matches(name, known, 1)), None) for name in sorted(unknown)}
 
 

@@ -33,10 +33,17 @@ class Patches:
     def __len__(self) -> int:
         return len(self.points)
 
-    def pool(self, features: Tensor) -> Tensor:
-        """The largest of each feature (P, C) over the members of a patch, (Q, C); features are not negative."""
-        pooled = torch.zeros(len(self), features.shape[1], device=features.device)
-        return pooled.scatter_reduce(0, self.member_of[:, None].expand_as(features), features, "amax")
+
+def pool(features: Tensor, member_of: Tensor, count: int) -> Tensor:
+    """The largest of each feature (P, C) over the members of each of `count` patches, (count, C).
+
+    Args:
+        features: not negative.
+        member_of: (P,) patch of each row.
+        count: number of patches.
+    """
+    pooled = torch.zeros(count, features.shape[1], device=features.device)
+    return pooled.scatter_reduce(0, member_of[:, None].expand_as(features), features, "amax")
 
 
 def group(cloud: PreparedCloud, size: float) -> Patches:

@@ -203,7 +203,8 @@ def _read_part(path: Path) -> Iterator[tuple[dict[str, Any], list[ArchivedView]]
     def take(name: str, count: int) -> NDArray[Any]:
         begin = position[name]
         position[name] += count
-        return arrays[name][begin : begin + count]
+        taken: NDArray[Any] = arrays[name][begin : begin + count]
+        return taken
 
     for pile in arrays["scene_kind"]:
         num_objects = int(take("scene_objects", 1)[0])

@@ -30,7 +30,7 @@ def decode_json(body: bytearray, max_points: int) -> Payload:
     options = option_texts(values)
     if points is None:
         raise Invalid("points", "is missing; give [[x, y, z], ...] in metres")
-    return Payload(_points_of_json(points, max_points), options)
+    return Payload(points_of_json(points, max_points), options)
 
 
 def object_error(body: bytes | bytearray, error: Exception, expected: str, name: str = "body") -> ServiceError:
@@ -61,7 +61,7 @@ _CHUNK = 1 << 17
 """Bytes of points decoded in one go: some 3 ms and a few MB, whatever the size of the cloud."""
 
 
-def _points_of_json(text: memoryview, max_points: int) -> Points:
+def points_of_json(text: memoryview, max_points: int) -> Points:
     """(N, 3) float32 of the text of an array of triples, which is known to be JSON."""
     parts: list[Points] = []
     count = 0

@@ -11,7 +11,7 @@ from tesnet.errors import WeightsError
 from tesnet.networks.tesnet import TesNet, TesNetConfig
 
 Network = TesNet
-"""What scores candidates: `encode(cloud)` once, then `score(features, cloud, candidates)`."""
+"""What scores candidates: `encode(cloud)` or `encode_batch(clouds)` once, then `score(features, cloud, candidates)`."""
 
 NETWORKS: Mapping[str, tuple[type[TesNet], type[TesNetConfig]]] = {"tesnet": (TesNet, TesNetConfig)}
 

@@ -7,6 +7,8 @@ encoded once; what a candidate adds is a gather, a small shared MLP over the poi
 
 from __future__ import annotations
 
+import itertools
+from collections.abc import Sequence
 from dataclasses import dataclass
 
 import torch
@@ -17,7 +19,7 @@ from tesnet.cloud import PreparedCloud
 from tesnet.collision import points_in_grasp_frames
 from tesnet.geometry import PANDA
 from tesnet.layers import PointTransformerConv, SAGEConv
-from tesnet.patches import Patches, group
+from tesnet.patches import Patches, group, pool
 from tesnet.visibility import depth_behind
 
 _POINT_INPUTS = 7
@@ -193,18 +195,36 @@ class TesNet(nn.Module):
 
     def encode(self, cloud: PreparedCloud) -> CloudFeatures:
         """Features of every point and of the whole cloud; computed once, shared by all candidates."""
-        lifted = torch.relu(self.lift(point_inputs(cloud)))
-        fine = torch.cat([lifted, self.stage(lifted, cloud.neighbours, edge_inputs(cloud))], dim=1)
-        patches = group(cloud, self.config.patch_size)
-        x = torch.relu(self.widen(patches.pool(fine)))
-        edges = edge_features(patches.points, patches.normals, patches.neighbours)
+        return self.encode_batch([cloud])[0]
+
+    def encode_batch(self, clouds: Sequence[PreparedCloud]) -> list[CloudFeatures]:
+        """The features of each of several clouds, in one pass over the stacked graphs of all of them.
+
+        They equal those of `encode` up to the rounding of float32, which depends on the size of a matrix product.
+        """
+        all_patches = [group(cloud, self.config.patch_size) for cloud in clouds]
+        lifted = torch.relu(self.lift(torch.cat([point_inputs(cloud) for cloud in clouds])))
+        neighbours = _stacked([cloud.neighbours for cloud in clouds], [len(cloud) for cloud in clouds])
+        edges = torch.cat([edge_features(cloud.points, cloud.normals, cloud.neighbours) for cloud in clouds])
+        fine = torch.cat([lifted, self.stage(lifted, neighbours, edges)], dim=1)
+
+        sizes = [len(patches) for patches in all_patches]
+        member_of = _stacked([patches.member_of for patches in all_patches], sizes)
+        neighbours = _stacked([patches.neighbours for patches in all_patches], sizes)
+        edges = torch.cat([edge_features(p.points, p.normals, p.neighbours) for p in all_patches])
+        x = torch.relu(self.widen(pool(fine, member_of, sum(sizes))))
         depths = [x]
         for stage in self.wide_stages:
-            x = stage(x, patches.neighbours, edges)
+            x = stage(x, neighbours, edges)
             depths.append(x)
         merged = self.merge_wide(torch.cat(depths, dim=1))
-        points = torch.relu(self.merge_points(fine) + merged.index_select(0, patches.member_of))
-        return CloudFeatures(points, patches, x, self.context(x.amax(dim=0)))
+        points = torch.relu(self.merge_points(fine) + merged.index_select(0, member_of))
+        return [
+            CloudFeatures(of_points, patches, wide, self.context(wide.amax(dim=0)))
+            for of_points, patches, wide in zip(
+                points.split([len(cloud) for cloud in clouds]), all_patches, x.split(sizes), strict=True
+            )
+        ]
 
     def score(
         self, features: CloudFeatures, cloud: PreparedCloud, candidates: Candidates, mirror: Tensor | None = None
@@ -249,9 +269,10 @@ def point_inputs(cloud: PreparedCloud) -> Tensor:
     return torch.cat([10 * cloud.spectrum[:, :1], cloud.spectrum[:, 1:], facing, upright, height], dim=1)
 
 
-def edge_inputs(cloud: PreparedCloud) -> Tensor:
-    """(P, k, 4) edge features of the cloud's own graph."""
-    return edge_features(cloud.points, cloud.normals, cloud.neighbours)
+def _stacked(tables: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
+    """Tables of indices one below the other, each raised by the sizes of those before it."""
+    before = itertools.accumulate(sizes, initial=0)
+    return torch.cat([table + start for table, start in zip(tables, before, strict=False)])
 
 
 def edge_features(points: Tensor, normals: Tensor, neighbours: Tensor) -> Tensor:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import socket
 import threading
 import time
-from collections.abc import Callable, Iterator
+from collections.abc import Callable, Iterator, Sequence
 from dataclasses import dataclass, field
 from typing import Any
 
@@ -17,6 +17,7 @@ from numpy.typing import NDArray
 
 from service.app import create_app
 from service.grasps import GraspEndpoint
+from service.protocol import PunctualProtocol
 from service.settings import Settings
 from tesnet.geometry import GraspSet
 from tesnet.query import GraspQuery
@@ -56,6 +57,7 @@ class GatedPredictor:
     entered: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
     seeds: list[int] = field(default_factory=list)
     fault: Exception | None = None
+    batches: list[int] = field(default_factory=list)
 
     device = "cpu"
 
@@ -66,7 +68,11 @@ class GatedPredictor:
     def warm_up(self) -> None:
         pass
 
-    def predict(self, query: GraspQuery) -> GraspResult:
+    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[GraspResult]:
+        self.batches.append(len(queries))
+        return [self._predict(query) for query in queries]
+
+    def _predict(self, query: GraspQuery) -> GraspResult:
         self.entered.release()
         self.seeds.append(query.seed)
         assert self.gate.wait(60)
@@ -100,12 +106,12 @@ def serve() -> Iterator[Callable[..., LocalServer]]:
     """Start a server over a `GatedPredictor`: `serve(queue_size=1)`. At the end gates open and servers stop."""
     started: list[tuple[GatedPredictor, uvicorn.Server, threading.Thread]] = []
 
-    def start(**settings: Any) -> LocalServer:
+    def start(protocol: type[PunctualProtocol] = PunctualProtocol, **settings: Any) -> LocalServer:
         predictor = GatedPredictor()
         ready = threading.Event()
         app = create_app(Settings(**settings), lambda: predictor, on_ready=ready.set)
         listener = socket.create_server(("127.0.0.1", 0))
-        server = uvicorn.Server(uvicorn.Config(app, log_config=None, access_log=False, ws="none"))
+        server = uvicorn.Server(uvicorn.Config(app, http=protocol, log_config=None, access_log=False, ws="none"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         started.append((predictor, server, thread))

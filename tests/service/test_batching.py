@@ -3,7 +3,8 @@
 from __future__ import annotations
 
 import threading
-from collections.abc import Iterator
+import time
+from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
 from typing import Any
 
@@ -11,7 +12,7 @@ import numpy as np
 import pytest
 
 from service.batching import PredictionWorker
-from service.errors import NotReady, QueueFull
+from service.errors import DeadlineExceeded, NotReady, QueueFull
 from tesnet.query import GraspQuery
 
 
@@ -29,12 +30,12 @@ class Echo:
     def warm_up(self) -> None:
         assert threading.current_thread() is self.made_in
 
-    def predict(self, query: GraspQuery) -> Any:
+    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[Any]:
         self.entered.release()
         assert self.gate.wait(30)
-        if query.seed == 13:
+        if any(query.seed == 13 for query in queries):
             raise ValueError("unlucky")
-        return threading.current_thread()
+        return [threading.current_thread() for _ in queries]
 
 
 @pytest.fixture
@@ -47,20 +48,33 @@ def made() -> list[Echo]:
     return []
 
 
+StartWorker = Callable[..., PredictionWorker]
+
+
 @pytest.fixture
-def worker(made: list[Echo]) -> Iterator[PredictionWorker]:
-    ready = threading.Event()
+def start(made: list[Echo]) -> Iterator[StartWorker]:
+    workers: list[PredictionWorker] = []
 
     def factory() -> Echo:
         made.append(Echo())
         return made[0]
 
-    worker = PredictionWorker(factory, capacity=2, on_ready=ready.set)
-    worker.start()
-    assert ready.wait(30)
-    yield worker
+    def make(**options: Any) -> PredictionWorker:
+        ready = threading.Event()
+        workers.append(PredictionWorker(factory, on_ready=ready.set, **options))
+        workers[0].start()
+        assert ready.wait(30)
+        return workers[0]
+
+    yield make
     made[0].gate.set()
-    worker.stop()
+    for worker in workers:
+        worker.stop()
+
+
+@pytest.fixture
+def worker(start: StartWorker) -> PredictionWorker:
+    return start(capacity=2)
 
 
 def test_one_thread_makes_and_uses_the_predictor(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:
@@ -100,17 +114,73 @@ def test_a_query_that_fails_does_not_end_the_worker(
     assert worker.submit(query).future.result(30) is not None
 
 
-def test_stopping_cancels_what_waits(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:
+def test_what_waits_is_predicted_together_up_to_the_limit(
+    start: StartWorker, made: list[Echo], query: GraspQuery
+) -> None:
+    sizes: list[int] = []
+    worker = start(capacity=8, max_batch=3, on_batch=sizes.append)
+    first = worker.submit(query)
+    assert made[0].entered.acquire(timeout=30)
+    others = [worker.submit(query) for _ in range(4)]
+    made[0].gate.set()
+    answers = [job.future.result(30) for job in (first, *others)]
+    assert [answer.batch_size for answer in answers] == [1, 3, 3, 3, 1]
+    assert sizes == [1, 3, 1]
+
+
+def test_a_fault_in_a_batch_is_told_to_its_own_query_alone(
+    start: StartWorker, made: list[Echo], query: GraspQuery
+) -> None:
+    worker = start(capacity=8, max_batch=8)
+    first = worker.submit(query)
+    assert made[0].entered.acquire(timeout=30)
+    good, bad, late = worker.submit(query), worker.submit(GraspQuery(query.points, seed=13)), worker.submit(query)
+    made[0].gate.set()
+    assert all(job.future.result(30) for job in (first, good, late))
+    with pytest.raises(ValueError, match="unlucky"):
+        bad.future.result(30)
+
+
+def test_a_query_whose_deadline_passed_is_never_predicted(
+    start: StartWorker, made: list[Echo], query: GraspQuery
+) -> None:
+    sizes: list[int] = []
+    worker = start(capacity=8, max_batch=8, on_batch=sizes.append)
+    running = worker.submit(query)
+    assert made[0].entered.acquire(timeout=30)
+    late = worker.submit(query, deadline=time.perf_counter() - 1)
+    made[0].gate.set()
+    with pytest.raises(DeadlineExceeded):
+        late.future.result(30)
+    assert running.future.result(30) is not None
+    assert sizes == [1]
+
+
+def test_a_query_whose_turn_would_come_after_its_deadline_is_refused_at_once(
+    worker: PredictionWorker, made: list[Echo], query: GraspQuery
+) -> None:
+    worker.submit(query)
+    assert made[0].entered.acquire(timeout=30)
+    worker.submit(query)
+    assert worker.expected_wait > 0
+    with pytest.raises(QueueFull, match="X-Request-Timeout") as refused:
+        worker.submit(query, deadline=time.perf_counter() + worker.expected_wait / 10)
+    assert refused.value.retry_after >= worker.expected_wait
+    worker.submit(query, deadline=time.perf_counter() + 60)
+
+
+def test_stopping_refuses_what_waits(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:
     running = worker.submit(query)
     assert made[0].entered.acquire(timeout=30)
     waiting = worker.submit(query)
     stopping = threading.Thread(target=worker.stop)
     stopping.start()
-    with pytest.raises(CancelledError):
+    with pytest.raises(NotReady, match="repeat"):
         waiting.future.result(30)
     made[0].gate.set()
     assert running.future.result(30) is not None
     stopping.join(30)
+    assert worker.stop()
     with pytest.raises(NotReady, match="stopped"):
         worker.submit(query)
 

@@ -257,7 +257,7 @@ def test_the_documentation_covers_bodies_options_and_problems(http: httpx.Client
     form = post["requestBody"]["content"]["multipart/form-data"]["schema"]["properties"]
     assert set(form) == {"cloud", "depth", "mask", "options"}
     assert set(document["components"]["schemas"]["DepthOptions"]["properties"]) == set(DepthOptions.model_fields)
-    assert set(post["responses"]) == {"200", "400", "406", "413", "415", "422", "429", "503", "504"}
+    assert set(post["responses"]) == {"200", "400", "401", "406", "413", "415", "422", "429", "503", "504"}
     assert all(
         "application/problem+json" in response["content"]
         for status, response in post["responses"].items()

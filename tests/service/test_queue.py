@@ -5,6 +5,7 @@ from __future__ import annotations
 import concurrent.futures
 import select
 import socket
+import time
 import urllib.parse
 from collections.abc import Callable, Iterator
 from typing import Any
@@ -12,6 +13,8 @@ from typing import Any
 import httpx
 import numpy as np
 import pytest
+
+from service.protocol import PunctualProtocol
 
 POINTS = np.zeros((20, 3), np.float32).tobytes()
 OCTETS = {"Content-Type": "application/octet-stream"}
@@ -78,6 +81,38 @@ def test_a_deadline_that_passes_is_a_504_and_the_queued_query_is_never_predicted
     server.predictor.gate.set()
     assert running.result().status_code == next_one.result().status_code == 200
     assert server.predictor.seeds == [1, 3]
+
+
+def test_requests_that_wait_are_predicted_together(
+    serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, eventually: Eventually
+) -> None:
+    server = serve(max_batch=4)
+    running = pool.submit(post, server.url)
+    assert server.predictor.entered.acquire(timeout=30)
+    waiting = [pool.submit(post, server.url, seed=seed) for seed in (1, 2, 3)]
+    eventually(lambda: "grasp_queue_depth 3.0" in httpx.get(f"{server.url}/metrics").text)
+    server.predictor.gate.set()
+    assert [answer.result().status_code for answer in (running, *waiting)] == [200] * 4
+    assert server.predictor.batches == [1, 3]
+    assert 'grasp_batch_size_bucket{le="2.0"} 1.0' in httpx.get(f"{server.url}/metrics").text
+
+
+def test_a_connection_whose_head_never_comes_is_closed(serve: Serve) -> None:
+    class Impatient(PunctualProtocol):
+        head_seconds = 0.2
+
+    server = serve(protocol=Impatient)
+    server.predictor.gate.set()
+    parts = urllib.parse.urlsplit(server.url)
+    address = (parts.hostname or "", parts.port or 0)
+    with socket.create_connection(address, timeout=30) as silent, socket.create_connection(address, 30) as slow:
+        slow.sendall(b"POST /grasps HT")
+        assert silent.recv(1) == slow.recv(1) == b""
+    with post_head(server.url) as decent:
+        time.sleep(0.4)  # a body has the request's deadline, not the head's
+        decent.sendall(POINTS)
+        assert decent.recv(4096).startswith(b"HTTP/1.1 200 ")
+    assert post(server.url).status_code == 200
 
 
 def test_the_default_deadline_is_a_setting(serve: Serve) -> None:

@@ -1,11 +1,12 @@
 from __future__ import annotations
 
+import math
 import os
 from pathlib import Path
 
 import pytest
 
-from service.settings import InvalidSetting, load_settings, unknown_variables
+from service.settings import InvalidSetting, cpu_quota, load_settings, unknown_variables
 
 
 def test_an_empty_environment_gives_the_documented_defaults() -> None:
@@ -24,7 +25,7 @@ def test_every_value_is_text_and_an_empty_one_means_the_default() -> None:
             "GRASP_DEVICE": "CUDA:1",
             "GRASP_NUM_THREADS": "",
             "GRASP_MAX_BODY_MB": "0.5",
-            "GRASP_MAX_BATCH": "1",
+            "GRASP_MAX_BATCH": "8",
             "OTHER": "x",
         }
     )
@@ -43,10 +44,11 @@ def test_every_value_is_text_and_an_empty_one_means_the_default() -> None:
         ("GRASP_MAX_POINTS", "-1", "100,000,000"),
         ("GRASP_MAX_BODY_MB", "nan", "4096"),
         ("GRASP_QUEUE_SIZE", "2.5", "10,000"),
-        ("GRASP_MAX_BATCH", "8", "one at a time"),
+        ("GRASP_MAX_BATCH", "65", "together"),
         ("GRASP_MODELS", "tesnet,gpd", "tesnet"),
         ("GRASP_REQUEST_TIMEOUT", "0", "3600"),
         ("GRASP_DRAIN_TIMEOUT", "inf", "3600"),
+        ("GRASP_CORS_ORIGINS", "robot.example", "https://"),
         ("GRASP_LOG_LEVEL", "loud", "debug"),
     ],
 )
@@ -58,10 +60,30 @@ def test_an_invalid_value_names_variable_value_and_remedy(variable: str, value: 
     assert word in str(refused.value)
 
 
-def test_api_keys_are_refused_rather_than_ignored() -> None:
-    with pytest.raises(InvalidSetting, match="GRASP_API_KEYS"):
-        load_settings({"GRASP_API_KEYS": "secret"})
+def test_threads_follow_the_quota_of_the_container(tmp_path: Path) -> None:
+    assert cpu_quota(tmp_path) == math.inf
+    (tmp_path / "cpu").mkdir()
+    (tmp_path / "cpu" / "cpu.cfs_quota_us").write_text("-1\n")
+    (tmp_path / "cpu" / "cpu.cfs_period_us").write_text("100000\n")
+    assert cpu_quota(tmp_path) == math.inf
+    (tmp_path / "cpu" / "cpu.cfs_quota_us").write_text("250000\n")
+    assert cpu_quota(tmp_path) == 2.5
+    (tmp_path / "cpu.max").write_text("50000 100000\n")
+    assert cpu_quota(tmp_path) == 0.5
+    (tmp_path / "cpu.max").write_text("max 100000\n")
+    assert cpu_quota(tmp_path) == math.inf
+
+
+def test_keys_and_origins_are_lists_and_keys_are_never_shown() -> None:
+    settings = load_settings({"GRASP_API_KEYS": "first, second", "GRASP_CORS_ORIGINS": "https://robot.example,*"})
+    assert [key.get_secret_value() for key in settings.api_keys] == ["first", "second"]
+    assert "first" not in repr(settings)
+    assert settings.cors_origins == ("https://robot.example", "*")
     assert load_settings({"GRASP_API_KEYS": ""}) == load_settings({})
+    for wrong in ("hush,", "hush hush", "h\u00fcsh"):
+        with pytest.raises(InvalidSetting, match="GRASP_API_KEYS") as refused:
+            load_settings({"GRASP_API_KEYS": wrong})
+        assert wrong not in str(refused.value)
 
 
 def test_unknown_variables_come_with_the_closest_known_name() -> None:

@@ -9,7 +9,7 @@ import torch
 
 from tesnet import candidates, cloud, networks
 from tesnet.candidates import Candidates
-from tesnet.networks.tesnet import CloudFeatures, edge_inputs, point_inputs
+from tesnet.networks.tesnet import CloudFeatures, edge_features, point_inputs
 from tests.tesnet.scenes import CAMERA, ask, fresh_network, prepared, tabletop, tabletop_query
 
 
@@ -121,7 +121,7 @@ def test_a_mirrored_scene_scores_as_the_mirror_option_says() -> None:
 
 def test_point_pair_features_are_distances_and_cosines() -> None:
     ready, _ = example()
-    edges = edge_inputs(ready)
+    edges = edge_features(ready.points, ready.normals, ready.neighbours)
     assert edges.shape == (len(ready), 16, 4)
     for point in range(0, len(ready), 300):
         other = int(ready.neighbours[point, 5])

@@ -4,7 +4,7 @@ import numpy as np
 import torch
 
 from tesnet.cloud import sight_axes
-from tesnet.patches import group
+from tesnet.patches import group, pool
 from tests.tesnet.scenes import prepared, tabletop_query
 
 SIZE = 0.011
@@ -29,6 +29,6 @@ def test_pooling_takes_the_largest_of_each_feature_over_the_members() -> None:
     ready = prepared(tabletop_query())
     patches = group(ready, SIZE)
     features = torch.rand(len(ready), 5, generator=torch.Generator().manual_seed(1))
-    pooled = patches.pool(features)
+    pooled = pool(features, patches.member_of, len(patches))
     for number in range(0, len(patches), 5):
         torch.testing.assert_close(pooled[number], features[patches.member_of == number].amax(dim=0))

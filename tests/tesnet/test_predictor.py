@@ -190,6 +190,29 @@ def test_what_the_caller_should_know_is_a_warning(query: GraspQuery, says: str) 
     assert [says in note for note in predictor().predict(query).warnings] == [True]
 
 
+# Batches
+
+
+def test_a_batch_has_the_answers_of_its_queries_one_by_one() -> None:
+    """Scores to 1e-5: the rounding of a matrix product depends on its size. All else is equal to the bit."""
+    nothing = GraspQuery(np.zeros((5, 3), np.float32))
+    queries = [
+        tabletop_query(),
+        nothing,
+        tabletop_query(1, max_grasps=50),
+        replace(tabletop_query(2), points=tabletop_query(2).points[::3]),
+    ]
+    together = predictor().predict_batch(queries)
+    for query, batched in zip(queries, together, strict=True):
+        alone = predictor().predict(query)
+        assert_sound(batched, query)
+        assert batched.counts == alone.counts
+        assert (batched.reason, batched.warnings) == (alone.reason, alone.warnings)
+        np.testing.assert_array_equal(batched.grasps.Ts_cloud_grasp, alone.grasps.Ts_cloud_grasp)
+        np.testing.assert_allclose(batched.grasps.scores, alone.grasps.scores, atol=1e-5)
+    assert predictor().predict_batch([]) == []
+
+
 # Repetition
 
 

@@ -1,0 +1,390 @@
+"""The Open Inference Protocol v2 over HTTP, as KServe and Triton clients speak it, in front of the same endpoint.
+
+One input, `points` FP32 [-1, 3]; options in `parameters`, each as JSON or as a string that holds JSON or a plain word;
+outputs named as in the .npz. Tensors travel as JSON or, by the binary tensor extension, as raw little-endian bytes
+behind the JSON, whose length `Inference-Header-Content-Length` tells.
+"""
+
+from __future__ import annotations
+
+import math
+import re
+from collections.abc import Iterator, Mapping
+from typing import Any
+
+import msgspec
+import numpy as np
+from fastapi import APIRouter, Request, Response
+from numpy.typing import NDArray
+
+from service import schemas
+from service.answers import answer_arrays, answer_meta
+from service.batching import PredictionWorker
+from service.errors import (
+    INFERENCE_PROTOCOL,
+    DeadlineExceeded,
+    Invalid,
+    NotReady,
+    QueueFull,
+    TooLarge,
+    Unauthorized,
+    Undecodable,
+    UnknownContentType,
+    UnknownModel,
+    shortened,
+)
+from service.grasps import Asked, GraspEndpoint, Reader, check_model, refuse_compressed
+from service.openapi import problems
+from service.payloads import JSON, OCTET_STREAM, Payload, build_query, parse_options
+from service.payloads.json_body import object_error, points_of_json
+from service.payloads.options import json_text, option_texts, raw_object, raw_values
+from service.payloads.payload import Points, as_float32, check_count, refuse_empty
+from service.schemas import GraspOptions
+from service.settings import Settings, service_version
+from tesnet.result import GraspResult
+
+HEADER_LENGTH = "Inference-Header-Content-Length"
+INPUT = schemas.TensorMetadata(name="points", datatype="FP32", shape=[-1, 3])
+OUTPUTS = [
+    schemas.TensorMetadata(name=name, datatype=datatype, shape=shape)
+    for name, datatype, shape in (
+        ("scores", "FP64", [-1]),
+        ("poses", "FP64", [-1, 4, 4]),
+        ("hand_poses", "FP64", [-1, 4, 4]),
+        ("pregrasps", "FP64", [-1, 4, 4]),
+        ("widths", "FP64", [-1]),
+        ("approach_points", "FP64", [-1, 3]),
+        ("contact_points", "FP64", [-1, 3]),
+        ("meta", "BYTES", [1]),
+    )
+]
+
+_FIELDS = ("id", "parameters", "inputs", "outputs")
+_BINARY_OUTPUT = "binary_data_output"
+_MAX_FIELD_BYTES = 65_536
+"""JSON text of `id` and of `outputs`."""
+_CHUNK = 1 << 17
+"""Bytes of numbers decoded in one go, some milliseconds."""
+
+
+class _InputParameters(msgspec.Struct, forbid_unknown_fields=True):
+    binary_data_size: int | None = None
+
+
+class _Input(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    shape: tuple[int, int]
+    datatype: str
+    data: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
+    parameters: _InputParameters = msgspec.field(default_factory=_InputParameters)
+
+
+class _OutputParameters(msgspec.Struct, forbid_unknown_fields=True):
+    binary_data: bool | None = None
+
+
+class _Output(msgspec.Struct, forbid_unknown_fields=True):
+    name: str
+    parameters: _OutputParameters = msgspec.field(default_factory=_OutputParameters)
+
+
+_REQUEST = raw_object(_FIELDS)
+_PARAMETERS = raw_object((*GraspOptions.model_fields, _BINARY_OUTPUT))
+_NUMBERS = msgspec.json.Decoder(list[float])
+
+
+_TENSORS = {"type": "array", "items": {"type": "object"}}
+_INFER_REQUEST: dict[str, Any] = {
+    "requestBody": {
+        "required": True,
+        "content": {
+            JSON: {
+                "schema": {
+                    "type": "object",
+                    "required": ["inputs"],
+                    "properties": {
+                        "id": {"type": "string", "description": "Comes back in the answer."},
+                        "parameters": {
+                            "type": "object",
+                            "description": "Options, as in `POST /grasps`; a string holds JSON or a plain word. "
+                            f"`{_BINARY_OUTPUT}`: send every output as bytes.",
+                        },
+                        "inputs": {**_TENSORS, "description": "One: points FP32 [-1, 3]."},
+                        "outputs": {**_TENSORS, "description": "The wanted ones; all where none is named."},
+                    },
+                },
+                "example": {
+                    "parameters": {"up": "[0, 0, 1]"},
+                    "inputs": [{"name": "points", "datatype": "FP32", "shape": [1, 3], "data": [0.01, 0.02, 0.51]}],
+                },
+            },
+            OCTET_STREAM: {
+                "schema": {
+                    "type": "string",
+                    "format": "binary",
+                    "description": f"The JSON, of `{HEADER_LENGTH}` bytes, and the input's bytes behind it.",
+                }
+            },
+        },
+    }
+}
+_INFER_RESPONSES: dict[int | str, dict[str, Any]] = {
+    200: {
+        "description": "The outputs, as JSON or with bytes behind it.",
+        "content": {JSON: {"schema": {"type": "object"}}, OCTET_STREAM: {"schema": {"type": "string"}}},
+    }
+}
+_INFER_PROBLEMS = (
+    Undecodable,
+    Unauthorized,
+    UnknownModel,
+    TooLarge,
+    UnknownContentType,
+    Invalid,
+    QueueFull,
+    NotReady,
+    DeadlineExceeded,
+)
+
+
+def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: GraspEndpoint) -> APIRouter:
+    """The routes under `/v2`.
+
+    Args:
+        settings: the limits.
+        worker: knows the network.
+        endpoint: answers, with the same queue, deadlines and limits as `POST /grasps`.
+    """
+    router = APIRouter(prefix=INFERENCE_PROTOCOL, tags=["inference protocol"])
+    model_problems = problems(NotReady, UnknownModel)
+
+    def check_path(model: str, version: str | None) -> None:
+        loaded = worker.model
+        if model != loaded.name or version not in (None, loaded.version):
+            what = shortened(model if version is None else f"{model}, version {version}")
+            raise UnknownModel(f"{what} is not loaded; loaded: {loaded.name}, version {loaded.version}.")
+
+    @router.get("", summary="Server metadata")
+    async def server() -> schemas.ServerMetadata:
+        return schemas.ServerMetadata(name="tes-net", version=service_version(), extensions=["binary_tensor_data"])
+
+    @router.get("/health/live", summary="Does the process work?", responses=problems(NotReady))
+    async def live() -> dict[str, bool]:
+        worker.check_live()
+        return {"live": True}
+
+    @router.get("/health/ready", summary="Does the service take requests?", responses=problems(NotReady))
+    async def ready() -> dict[str, bool]:
+        endpoint.check_ready()
+        return {"ready": True}
+
+    async def describe(model: str, version: str | None = None) -> schemas.ModelMetadata:
+        check_path(model, version)
+        return schemas.ModelMetadata(
+            name=model, versions=[worker.model.version], platform="pytorch", inputs=[INPUT], outputs=OUTPUTS
+        )
+
+    async def model_ready(model: str, version: str | None = None) -> dict[str, bool]:
+        check_path(model, version)
+        endpoint.check_ready()
+        return {"ready": True}
+
+    async def infer(request: Request, model: str, version: str | None = None) -> Response:
+        def reader_of(request: Request) -> Reader:
+            check_path(model, version)
+            return _reader(request, settings, worker)
+
+        return await endpoint.answer(request, reader_of)
+
+    for path in ("/models/{model}", "/models/{model}/versions/{version}"):
+        router.get(path, summary="Model metadata", responses=model_problems)(describe)
+        router.get(f"{path}/ready", summary="Does the model take requests?", responses=model_problems)(model_ready)
+        router.post(
+            f"{path}/infer",
+            summary="Grasps for a point cloud",
+            response_class=Response,
+            responses=_INFER_RESPONSES | problems(*_INFER_PROBLEMS),
+            openapi_extra=_INFER_REQUEST,
+        )(infer)
+    return router
+
+
+def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> Reader:
+    refuse_compressed(request)
+    head_length = request.headers.get(HEADER_LENGTH)
+    if head_length is not None and not re.fullmatch(r"\d{1,10}", head_length):
+        raise Invalid(HEADER_LENGTH, f"is {shortened(head_length)}; give the bytes of the JSON at the body's beginning")
+    request_id = request.state.record.request_id
+
+    def read(body: bytearray) -> Asked:
+        refuse_empty(body)
+        head = len(body) if head_length is None else int(head_length)
+        if head > len(body):
+            raise Undecodable(f"{HEADER_LENGTH} is {head}, but the body has {len(body)} bytes; it was cut off.")
+        fields = _fields(bytes(memoryview(body)[:head]))
+        parameters = _parameters(fields.get("parameters", memoryview(b"{}")))
+        all_binary = parameters.pop(_BINARY_OUTPUT, b"false")
+        if all_binary not in (b"true", b"false"):
+            raise Invalid(_BINARY_OUTPUT, f"is {shortened(all_binary.decode())}; give true or false")
+        outputs = _outputs(fields.get("outputs"), all_binary == b"true")
+        identity = _bounded(fields.get("id", memoryview(b'""')), "id", str)
+        points = _points(fields.get("inputs"), memoryview(body)[head:], settings.max_points)
+        options = parse_options(parameters, settings.max_points)
+        check_model(options, worker.model)
+
+        def write(result: GraspResult, timings_ms: Mapping[str, float]) -> Response:
+            arrays = answer_arrays(result, options)
+            meta = answer_meta(result, worker.model, timings_ms, request_id)
+            head = {"model_name": worker.model.name, "model_version": worker.model.version}
+            return _response(head | ({"id": identity} if identity else {}), arrays, meta, outputs)
+
+        return Asked(build_query(Payload(points), options), write)
+
+    return read
+
+
+def _fields(head: bytes) -> dict[str, memoryview]:
+    """The JSON text of each field of an inference request."""
+    try:
+        return raw_values(_REQUEST.decode(head))
+    except msgspec.ValidationError as error:
+        raise Invalid("body", f"is no inference request ({shortened(str(error))}); fields: {_FIELDS}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise Undecodable(
+            f"The JSON cannot be read ({shortened(str(error))}); where binary tensors follow it, {HEADER_LENGTH} must "
+            "tell its length."
+        ) from None
+
+
+def _parameters(text: memoryview) -> dict[str, bytes]:
+    """Options, and `binary_data_output`, as JSON text."""
+    try:
+        values = raw_values(_PARAMETERS.decode(text))
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise object_error(bytes(text), error, '{"max_grasps": 5, ...}', "parameters") from None
+    texts = option_texts(values)
+    return {
+        name: json_text(name, msgspec.json.decode(value, type=str).encode()) if value[:1] == b'"' else value
+        for name, value in texts.items()
+    }
+
+
+def _bounded(text: memoryview, name: str, kind: Any) -> Any:
+    """A small field's value.
+
+    Raises:
+        Invalid: it is large, or of another type.
+    """
+    if len(text) > _MAX_FIELD_BYTES:
+        raise Invalid(name, f"has {len(text)} bytes (limit {_MAX_FIELD_BYTES}); shorten it")
+    try:
+        return msgspec.json.decode(text, type=kind)
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise Invalid(name, f"cannot be used: {shortened(str(error))}") from None
+
+
+def _outputs(text: memoryview | None, all_binary: bool) -> dict[str, bool]:
+    """The wanted outputs, each with whether it is to be binary; all of them where none is named."""
+    asked: list[_Output] = [] if text is None else _bounded(text, "outputs", list[_Output])
+    known = [output.name for output in OUTPUTS]
+    for output in asked:
+        if output.name not in known:
+            raise Invalid("outputs", f"name {shortened(output.name)}, which there is not; valid: {', '.join(known)}")
+    if not asked:
+        return dict.fromkeys(known, all_binary)
+    chosen = {output.name: output.parameters.binary_data for output in asked}
+    return {name: all_binary if binary is None else binary for name, binary in chosen.items()}
+
+
+def _points(text: memoryview | None, tail: memoryview, max_points: int) -> Points:
+    """The input tensor (N, 3), from the JSON or from the bytes behind it."""
+    if text is None:
+        raise Invalid("inputs", f"are missing; give one, {INPUT.name} {INPUT.datatype} {INPUT.shape}")
+    try:
+        (given,) = msgspec.json.decode(text, type=tuple[_Input])
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise Invalid(
+            "inputs", f"cannot be used ({shortened(str(error))}); give one, {INPUT.name} {INPUT.datatype} {INPUT.shape}"
+        ) from None
+    if (given.name, given.datatype) != (INPUT.name, INPUT.datatype):
+        what = shortened(f"{given.name} of {given.datatype}")
+        raise Invalid("inputs", f"hold {what}; give {INPUT.name} of {INPUT.datatype}")
+    count, width = given.shape
+    if count < 0 or width != 3:
+        raise Invalid("inputs", f"have shape [{count}, {width}]; give [N, 3]")
+    check_count(count, max_points)
+    size = given.parameters.binary_data_size
+    if (size is None) == (given.data is msgspec.UNSET):
+        raise Invalid("inputs", "need either data or the parameter binary_data_size")
+    if size is not None:
+        return _binary_points(tail, count, size)
+    if len(tail):
+        raise Undecodable(f"{len(tail)} bytes follow the JSON, which announces no binary tensor.")
+    assert isinstance(given.data, msgspec.Raw)
+    points = _json_points(memoryview(given.data), max_points)
+    if len(points) != count:
+        raise Invalid("inputs", f"have {len(points)} points of data; the shape says {count}")
+    return points
+
+
+def _binary_points(tail: memoryview, count: int, size: int) -> Points:
+    if not size == len(tail) == 12 * count:
+        raise Undecodable(
+            f"binary_data_size is {size}, {len(tail)} bytes follow the JSON, and shape [{count}, 3] of FP32 needs "
+            f"{12 * count}; the three must agree."
+        )
+    return np.frombuffer(tail, "<f4").reshape(-1, 3)
+
+
+def _json_points(text: memoryview, max_points: int) -> Points:
+    """(N, 3) of an array of triples, or of their numbers in a row."""
+    flat = bytes(text)
+    if re.match(rb"\s*\[\s*\[", flat):
+        return points_of_json(text, max_points)
+    check_count(math.ceil(flat.count(b",") / 3), max_points)
+    try:
+        parts = [np.array(_NUMBERS.decode(chunk), np.float64) for chunk in _chunks(flat)]
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise Invalid("inputs", f"have data that are no numbers: {shortened(str(error))}") from None
+    numbers = np.concatenate(parts)
+    if len(numbers) % 3:
+        raise Invalid("inputs", f"have {len(numbers)} numbers of data, not a multiple of 3; give x, y, z of each point")
+    return as_float32(numbers.reshape(-1, 3))
+
+
+def _chunks(text: bytes) -> Iterator[bytes]:
+    """A JSON array of numbers as several; text of another form is cut where it means something else, and refused."""
+    start = 0
+    while (end := text.find(b",", start + _CHUNK)) >= 0:
+        yield (b"[" if start else b"") + text[start:end] + b"]"
+        start = end + 1
+    yield (b"[" if start else b"") + text[start:]
+
+
+def _response(
+    head: dict[str, str], arrays: Mapping[str, NDArray[np.float64]], meta: bytes, outputs: Mapping[str, bool]
+) -> Response:
+    """The answer: JSON, and behind it the tensors that were asked for as bytes."""
+    tensors: list[dict[str, Any]] = []
+    tail: list[bytes] = []
+    for described in OUTPUTS:
+        if described.name not in outputs:
+            continue
+        is_text = described.name == "meta"
+        array = None if is_text else arrays[described.name]
+        tensor: dict[str, Any] = {
+            "name": described.name,
+            "datatype": described.datatype,
+            "shape": [1] if array is None else list(array.shape),
+        }
+        if outputs[described.name]:
+            data = len(meta).to_bytes(4, "little") + meta if array is None else array.astype("<f8").tobytes()
+            tensor["parameters"] = {"binary_data_size": len(data)}
+            tail.append(data)
+        else:
+            tensor["data"] = [meta.decode()] if array is None else array.ravel().tolist()
+        tensors.append(tensor)
+    text = msgspec.json.encode(head | {"outputs": tensors})
+    if not tail:
+        return Response(text, media_type=JSON)
+    return Response(b"".join([text, *tail]), media_type=OCTET_STREAM, headers={HEADER_LENGTH: str(len(text))})

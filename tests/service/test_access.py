@@ -1,0 +1,84 @@
+"""API keys and cross-origin requests, as a server with such settings answers."""
+
+from __future__ import annotations
+
+import re
+from collections.abc import Callable
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from service.access import OPEN_PATHS
+from service.app import create_app
+from service.settings import load_settings
+
+Serve = Callable[..., Any]
+
+BODY = np.zeros((20, 3), np.float32).tobytes()
+OCTETS = {"Content-Type": "application/octet-stream"}
+GOOD = [{"Authorization": "Bearer second-key"}, {"authorization": "bearer first-key"}, {"X-API-Key": "first-key"}]
+BAD: list[dict[str, Any]] = [
+    {},
+    {"Authorization": "Bearer"},
+    {"Authorization": "Bearer first-ke"},
+    {"Authorization": "Bearer first-key2"},
+    {"Authorization": "Basic first-key"},
+    {"Authorization": "first-key"},
+    {"X-API-Key": ""},
+    {"X-API-Key": "first-key,second-key"},
+    {"X-API-Key": b"f\xff"},
+]
+
+
+def settings(**environment: str) -> dict[str, Any]:
+    chosen = load_settings(environment)
+    return {name: getattr(chosen, name) for name in chosen.model_fields_set}
+
+
+@pytest.fixture
+def guarded(serve: Serve) -> str:
+    server = serve(**settings(GRASP_API_KEYS="first-key,second-key"))
+    server.predictor.gate.set()
+    return str(server.url)
+
+
+def test_a_key_opens_and_nothing_else_does(guarded: str) -> None:
+    for headers in GOOD:
+        assert httpx.post(f"{guarded}/grasps", content=BODY, headers={**OCTETS, **headers}).status_code == 200
+    for refused_headers in BAD:
+        refused = httpx.post(f"{guarded}/grasps", content=BODY, headers={**OCTETS, **refused_headers})
+        assert refused.status_code == 401
+        assert refused.headers["Content-Type"] == "application/problem+json"
+        assert refused.headers["WWW-Authenticate"].startswith("Bearer ")
+        assert refused.json()["request_id"] == refused.headers["X-Request-ID"]
+        assert "-key" not in refused.text
+
+
+def test_every_other_route_needs_a_key_too(guarded: str) -> None:
+    app = create_app(load_settings({}), lambda: pytest.fail("is not started"))
+    pages = {"/docs", "/docs/oauth2-redirect", "/openapi.json"}
+    paths = pages | {re.sub(r"\{\w+\}", "tesnet", path) for path in app.openapi()["paths"]}
+    assert paths >= OPEN_PATHS
+    for path in paths:
+        status = httpx.get(f"{guarded}{path}").status_code
+        assert (status == 200) if path in OPEN_PATHS else (status == 401), path
+
+
+def test_browsers_are_not_let_in_unless_configured(serve: Serve, guarded: str) -> None:
+    page = {"Origin": "https://robot.example"}
+    preflight = {**page, "Access-Control-Request-Method": "POST", "Access-Control-Request-Headers": "X-API-Key"}
+    for answer in (
+        httpx.get(f"{guarded}/health/live", headers=page),
+        httpx.options(f"{guarded}/grasps", headers=preflight),
+    ):
+        assert not any(name.startswith("access-control-") for name in answer.headers)
+
+    url = serve(**settings(GRASP_API_KEYS="k", GRASP_CORS_ORIGINS="https://robot.example")).url
+    allowed = httpx.options(f"{url}/grasps", headers=preflight)
+    assert allowed.status_code == 200
+    assert allowed.headers["Access-Control-Allow-Origin"] == "https://robot.example"
+    assert httpx.get(f"{url}/model", headers={**page, "X-API-Key": "k"}).headers["Access-Control-Allow-Origin"]
+    other = httpx.get(f"{url}/model", headers={"Origin": "https://evil.example", "X-API-Key": "k"})
+    assert "Access-Control-Allow-Origin" not in other.headers

@@ -1,0 +1,203 @@
+"""The Open Inference Protocol, asked by Triton's own HTTP client and by hand."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+import tritonclient.http as triton
+from numpy.typing import NDArray
+from tritonclient.utils import InferenceServerException
+
+from service.inference_protocol import HEADER_LENGTH, OUTPUTS
+
+Cloud = NDArray[np.float32]
+
+INFER = "/v2/models/tesnet/infer"
+OPTIONS: dict[str, Any] = {"viewpoint": [0.35, 0, 0.5], "up": [0, 0, 1], "max_candidates": 200, "max_grasps": 3}
+ARRAYS = [output.name for output in OUTPUTS if output.name != "meta"]
+
+
+@pytest.fixture(scope="module")
+def client(service_url: str) -> Iterator[triton.InferenceServerClient]:
+    with triton.InferenceServerClient(service_url.removeprefix("http://"), network_timeout=120) as client:
+        yield client
+
+
+@pytest.fixture(scope="module")
+def expected(http: httpx.Client, cloud: Cloud) -> dict[str, Any]:
+    answer = http.post("/grasps", json={"points": cloud.tolist(), **OPTIONS}).json()
+    assert len(answer["grasps"]) == 3
+    return dict(answer)
+
+
+def tensor(points: Cloud, binary: bool) -> triton.InferInput:
+    given = triton.InferInput("points", list(points.shape), "FP32")
+    given.set_data_from_numpy(points, binary_data=binary)
+    return given
+
+
+def body(**changes: Any) -> dict[str, Any]:
+    points = {"name": "points", "datatype": "FP32", "shape": [2, 3], "data": [[0, 0, 0.5], [0.01, 0, 0.5]]}
+    return {"inputs": [points], **changes}
+
+
+def point(**changes: Any) -> list[dict[str, Any]]:
+    given = {"name": "points", "datatype": "FP32", "shape": [1, 3], "data": [0, 0, 0.5], **changes}
+    return [{name: value for name, value in given.items() if value is not None}]
+
+
+def test_server_and_model_describe_themselves(client: triton.InferenceServerClient, http: httpx.Client) -> None:
+    assert client.is_server_live()
+    assert client.is_server_ready()
+    assert client.is_model_ready("tesnet")
+    assert not client.is_model_ready("edgegrasp")
+    server = client.get_server_metadata()
+    assert (server["name"], server["extensions"]) == ("tes-net", ["binary_tensor_data"])
+    model = client.get_model_metadata("tesnet")
+    assert model["inputs"] == [{"name": "points", "datatype": "FP32", "shape": [-1, 3]}]
+    assert [output["name"] for output in model["outputs"]] == [*ARRAYS, "meta"]
+    version = http.get("/model").json()["models"][0]["version"]
+    assert model["versions"] == [version]
+    assert client.get_model_metadata("tesnet", version) == model
+    assert client.is_model_ready("tesnet", version)
+
+
+@pytest.mark.parametrize("binary_out", [True, False])
+@pytest.mark.parametrize("binary_in", [True, False])
+def test_tritons_client_gets_what_post_grasps_answers(
+    client: triton.InferenceServerClient, cloud: Cloud, expected: dict[str, Any], binary_in: bool, binary_out: bool
+) -> None:
+    outputs = [triton.InferRequestedOutput(output.name, binary_data=binary_out) for output in OUTPUTS]
+    result = client.infer("tesnet", [tensor(cloud, binary_in)], outputs=outputs, request_id="seven", parameters=OPTIONS)
+    answer = result.get_response()
+    assert (answer["model_name"], answer["id"]) == ("tesnet", "seven")
+    grasps = expected["grasps"]
+    for name, key in (
+        ("scores", "score"),
+        ("poses", "matrix"),
+        ("widths", "width"),
+        ("approach_points", "approach_point"),
+        ("contact_points", "contact_point"),
+    ):
+        np.testing.assert_allclose(result.as_numpy(name), [grasp[key] for grasp in grasps], atol=1e-6)
+    for name, key in (("hand_poses", "hand_pose"), ("pregrasps", "pregrasp")):
+        positions = result.as_numpy(name)[:, :3, 3]
+        np.testing.assert_allclose(positions, [grasp[key]["position"] for grasp in grasps], atol=1e-6)
+    (text,) = result.as_numpy("meta")
+    meta = json.loads(text)
+    assert meta["counts"] == expected["counts"]
+    assert meta["warnings"] == expected["warnings"]
+
+
+def test_without_named_outputs_all_come_as_bytes_and_nothing_found_is_empty_arrays(
+    client: triton.InferenceServerClient,
+) -> None:
+    result = client.infer("tesnet", [tensor(np.zeros((2, 3), np.float32), binary=True)])
+    assert [output["name"] for output in result.get_response()["outputs"]] == [*ARRAYS, "meta"]
+    assert result.as_numpy("poses").shape == (0, 4, 4)
+    assert json.loads(result.as_numpy("meta")[0])["reason"] == "too_few_points"
+
+
+def test_options_may_be_strings_as_the_protocol_wants_them(http: httpx.Client, cloud: Cloud) -> None:
+    texts = {name: json.dumps(value) for name, value in OPTIONS.items()} | {"frame_convention": "graspnet"}
+    given = {"name": "points", "datatype": "FP32", "shape": list(cloud.shape), "data": cloud.tolist()}
+    wanted = [{"name": "scores"}, {"name": "poses"}]
+    strings = http.post(INFER, json={"inputs": [given], "parameters": texts, "outputs": wanted}).json()
+    values = OPTIONS | {"frame_convention": "graspnet"}
+    assert http.post(INFER, json={"inputs": [given], "parameters": values, "outputs": wanted}).json() == strings
+    flat = given | {"data": cloud.ravel().tolist()}
+    assert http.post(INFER, json={"inputs": [flat], "parameters": values, "outputs": wanted}).json() == strings
+    assert [output["name"] for output in strings["outputs"]] == ["scores", "poses"]
+
+
+def test_tritons_client_shows_the_problems_detail(client: triton.InferenceServerClient) -> None:
+    points = tensor(np.zeros((2, 3), np.float32), binary=True)
+    with pytest.raises(InferenceServerException, match=r"max_grasps: is 0.*1000") as refused:
+        client.infer("tesnet", [points], parameters={"max_grasps": 0})
+    assert refused.value.status() == "422"
+    with pytest.raises(InferenceServerException, match="edgegrasp is not loaded"):
+        client.infer("edgegrasp", [points])
+    with pytest.raises(InferenceServerException, match="no option"):
+        client.infer("tesnet", [points], headers={"X-Request-Timeout": "5"}, parameters={"max_graps": 1})
+
+
+BAD: dict[str, tuple[Any, int, str]] = {
+    "nothing": (b"", 400, "empty"),
+    "no JSON": (b"points", 400, "JSON"),
+    "cut off": (b'{"inputs": [', 400, "JSON"),
+    "a list": ([], 422, "inference request"),
+    "an unknown field": (body(input=[]), 422, "input"),
+    "no inputs": ({}, 422, "missing"),
+    "two inputs": ({"inputs": point() * 2}, 422, "inputs"),
+    "an input of another name": ({"inputs": point(name="cloud")}, 422, "cloud"),
+    "an input of another type": ({"inputs": point(datatype="FP64")}, 422, "FP64"),
+    "another shape": ({"inputs": point(shape=[3])}, 422, "length"),
+    "pairs": ({"inputs": point(shape=[1, 2])}, 422, "[1, 2]"),
+    "a negative shape": ({"inputs": point(shape=[-1, 3])}, 422, "[-1, 3]"),
+    "too many points": ({"inputs": point(shape=[1_000_001, 3])}, 413, "1000000"),
+    "fewer data than the shape": ({"inputs": point(shape=[2, 3])}, 422, "1 points"),
+    "no triples": ({"inputs": point(data=[1, 2, 3, 4])}, 422, "multiple of 3"),
+    "words": ({"inputs": point(data=["a", 1, 2])}, 422, "number"),
+    "nested words": ({"inputs": point(data=[["a", 1, 2]])}, 422, "number"),
+    "too deep": ({"inputs": point(data=[[[1, 2, 3]]])}, 422, "points"),
+    "neither data nor bytes": ({"inputs": point(data=None)}, 422, "binary_data_size"),
+    "both": ({"inputs": point(parameters={"binary_data_size": 12})}, 422, "either"),
+    "bytes that do not come": ({"inputs": point(data=None, parameters={"binary_data_size": 12})}, 400, "agree"),
+    "shared memory": ({"inputs": point(parameters={"shared_memory_region": "x"})}, 422, "shared_memory_region"),
+    "an unknown output": (body(outputs=[{"name": "grasps"}]), 422, "hand_poses"),
+    "a class count": (body(outputs=[{"name": "scores", "parameters": {"classification": 1}}]), 422, "classification"),
+    "many outputs": (body(outputs=[{"name": "scores"}] * 9999), 422, "65536"),
+    "a number for an id": (body(id=1), 422, "id"),
+    "an unknown option": (body(parameters={"max_graps": 1}), 422, "max_grasps"),
+    "an option out of range": (body(parameters={"max_grasps": "0"}), 422, "max_grasps"),
+    "another network": (body(parameters={"model": "gpd"}), 422, "gpd"),
+    "a flag that is none": (body(parameters={"binary_data_output": 1}), 422, "true or false"),
+    "NaN": (b'{"inputs": [{"name": "points", "datatype": "FP32", "shape": [1, 3], "data": [NaN, 0, 0]}]}', 400, "JSON"),
+    "more than a float holds": ({"inputs": point(data=[1e300, 0, 0])}, 422, "infinite"),
+}
+
+
+@pytest.mark.parametrize("case", BAD)
+def test_a_bad_request_is_a_problem_whose_detail_is_also_the_error(http: httpx.Client, case: str) -> None:
+    given, status, word = BAD[case]
+    content = given if isinstance(given, bytes) else json.dumps(given).encode()
+    answer = http.post(INFER, content=content)
+    problem = answer.json()
+    assert (answer.status_code, answer.headers["Content-Type"]) == (status, "application/problem+json"), problem
+    assert word in problem["detail"]
+    assert problem["error"] == problem["detail"]
+    assert len(answer.text) < 2000
+
+
+def test_requests_are_counted_under_the_route_and_not_under_what_the_client_names(http: httpx.Client) -> None:
+    http.post(INFER, json=body())
+    http.get("/v2/models/whatever")
+    counted = http.get("/metrics").text
+    assert 'grasp_requests_total{method="POST",route="/v2/models/{model}/infer",status="200"}' in counted
+    assert "whatever" not in counted
+
+
+@pytest.mark.parametrize(
+    ("length", "tail", "status"),
+    [("0", 24, 400), ("x", 24, 422), ("999999", 24, 400), (None, 24, 400), ("", 23, 400), ("", 25, 400), ("", 24, 200)],
+)
+def test_the_length_of_the_json_and_of_the_bytes_must_fit(
+    http: httpx.Client, length: str | None, tail: int, status: int
+) -> None:
+    given = {"inputs": point(data=None, shape=[2, 3], parameters={"binary_data_size": 24})}
+    head = json.dumps(given).encode()
+    headers = {} if length is None else {HEADER_LENGTH: length or str(len(head))}
+    answer = http.post(INFER, content=head + bytes(tail), headers=headers)
+    assert answer.status_code == status, answer.text
+
+
+def test_a_compressed_body_is_a_415_and_another_version_a_404(http: httpx.Client) -> None:
+    compressed = http.post(INFER, content=b"x", headers={"Content-Encoding": "gzip"})
+    assert (compressed.status_code, "gzip" in compressed.json()["error"]) == (415, True)
+    missing = http.get("/v2/models/tesnet/versions/9")
+    assert (missing.status_code, "not loaded" in missing.json()["error"]) == (404, True)

@@ -1,0 +1,81 @@
+"""The log's own thread: what cannot be written is lost, counted and told; nobody waits for it."""
+
+from __future__ import annotations
+
+import contextlib
+import json
+import logging
+import os
+from collections.abc import Callable, Iterator
+from pathlib import Path
+
+import pytest
+
+from service import logs
+from service.logs import BackgroundHandler, JsonFormatter
+
+
+@pytest.fixture
+def logger() -> Iterator[logging.Logger]:
+    logger = logging.getLogger("tests.log")
+    logger.propagate = False
+    yield logger
+    for handler in list(logger.handlers):
+        logger.removeHandler(handler)
+        handler.close()
+
+
+def attach(logger: logging.Logger, descriptor: int) -> BackgroundHandler:
+    handler = BackgroundHandler(descriptor)
+    handler.setFormatter(JsonFormatter())
+    logger.addHandler(handler)
+    return handler
+
+
+def test_lines_arrive_whole_and_in_order(logger: logging.Logger, tmp_path: Path) -> None:
+    path = tmp_path / "log"
+    with path.open("wb") as file:
+        handler = attach(logger, file.fileno())
+        for number in range(100):
+            logger.warning("line", extra={"fields": {"number": number, "path": tmp_path}})
+        handler.close()
+    lines = [json.loads(line) for line in path.read_text(encoding="utf-8").splitlines()]
+    assert [line["number"] for line in lines] == list(range(100))
+    assert {line["path"] for line in lines} == {str(tmp_path)}
+
+
+def test_a_reader_that_stopped_costs_lines_which_are_counted_when_it_goes_on(
+    logger: logging.Logger, monkeypatch: pytest.MonkeyPatch, eventually: Callable[[Callable[[], bool]], None]
+) -> None:
+    monkeypatch.setattr(logs, "QUEUED_LINES", 10)
+    reading, writing = os.pipe()
+    handler = attach(logger, writing)
+    for _ in range(2000):  # more than a pipe holds, and nobody reads
+        logger.warning("x" * 100)
+    assert handler._lost > 0
+
+    received = b""
+    os.set_blocking(reading, False)
+
+    def all_accounted_for() -> bool:
+        nonlocal received
+        with contextlib.suppress(BlockingIOError):
+            received += os.read(reading, 2**20)
+        whole, _, _ = received.rpartition(b"\n")
+        lines = [json.loads(line) for line in whole.splitlines()]
+        total: int = sum(line.get("lines", 1) for line in lines)
+        return total == 2000
+
+    eventually(all_accounted_for)
+    handler.close()
+    os.close(reading)
+    os.close(writing)
+
+
+def test_a_full_disk_loses_lines_and_raises_nothing(logger: logging.Logger) -> None:
+    with Path("/dev/full").open("wb", buffering=0) as full:
+        handler = attach(logger, full.fileno())
+        for _ in range(10):
+            logger.warning("lost")
+        handler.close()
+        assert handler._lost == 10
