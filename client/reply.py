@@ -272,9 +272,8 @@ def problem(answer: Answer) -> ProblemError | ServiceUnreachable | UnexpectedRes
         document = schemas.Problem.model_validate_json(answer.body)
     except ValidationError:
         if answer.status in STATUSES_OF_LOST_SERVICES:
-            return ServiceUnreachable(
-                f"status {answer.status} without a problem document, as proxies answer when the service behind them ends"
-            )
+            why = "without a problem document, as proxies answer when they have lost the service behind them"
+            return ServiceUnreachable(f"status {answer.status} {why}")
         if answer.status not in STATUSES_OF_PROXIES:
             return _unexpected(answer, "it is no problem document")
         title = HTTPStatus(answer.status).phrase

@@ -23,7 +23,6 @@ from service.logs import configure_logging
 from service.settings import InvalidSetting, Settings, load_settings, service_version, unknown_variables, variables
 
 if TYPE_CHECKING:
-    from service.batching import Predictor, PredictorFactory
     from service.grasps import GraspEndpoint
 
 log = logging.getLogger("service")
@@ -52,6 +51,7 @@ def main() -> int:
 
 def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
     from service.app import create_app  # noqa: PLC0415 - after the port is known to be free
+    from service.loading import predictor_factory  # noqa: PLC0415 - the same
 
     host, port = listener.getsockname()[:2]
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
@@ -74,9 +74,12 @@ def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
         failures.append(error)
         server.should_exit = True
 
-    app = create_app(settings, _predictor_factory(settings), on_ready, on_failure)
+    app = create_app(settings, predictor_factory(settings), on_ready, on_failure)
     config = uvicorn.Config(
         app,
+        # Named, because uvicorn would take others where they happen to be installed.
+        loop="asyncio",
+        http="h11",
         log_config=None,
         access_log=False,
         ws="none",
@@ -91,17 +94,6 @@ def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
         return _fail_loading(failures[0])
     log.info("stopped")
     return 0
-
-
-def _predictor_factory(settings: Settings) -> PredictorFactory:
-    def make() -> Predictor:
-        from tesnet.predictor import GraspPredictor  # noqa: PLC0415 - loads torch, while the port answers already
-        from tesnet.weights import default_weights  # noqa: PLC0415 - the same
-
-        weights = settings.weights or default_weights(settings.models)
-        return GraspPredictor.load(weights, device=settings.device, num_threads=settings.num_threads)
-
-    return make
 
 
 class _Server(uvicorn.Server):
