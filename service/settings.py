@@ -113,14 +113,19 @@ class Replicas(BaseModel):
         default=0.0, ge=0, le=64, description="GPUs of a replica: 0, a share such as 0.25, or a whole number."
     )
 
+    @field_validator("gpus")
+    @classmethod
+    def _share_or_whole(cls, gpus: float) -> float:
+        if gpus > 1 and gpus != int(gpus):
+            raise ValueError("a share of a GPU is less than 1")
+        return gpus
+
     @model_validator(mode="after")
     def _fits(self) -> Replicas:
         if self.max_replicas < self.min_replicas:
             raise ValueError(
                 f"is {self.max_replicas}, less than --min-replicas, {self.min_replicas}; give at least that"
             )
-        if self.gpus > 1 and self.gpus != int(self.gpus):
-            raise ValueError(f"gpus is {self.gpus:g}; a share of a GPU is less than 1, above that give whole ones")
         return self
 
 
