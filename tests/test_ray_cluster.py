@@ -31,6 +31,13 @@ REQUESTS = 4
 pytestmark = [pytest.mark.slow, pytest.mark.sim]
 
 
+class OnRay(ServiceProcess):
+    """Ray puts lines of its own between those of the command."""
+
+    def parse(self, text: str) -> dict[str, Any] | None:
+        return super().parse(text) if text.startswith("{") else None
+
+
 @pytest.fixture(scope="module")
 def settings_of_ray() -> dict[str, str]:
     """A cluster of our own that tells nobody of itself, and keeps the replicas' output out of ours."""
@@ -47,7 +54,7 @@ def served(settings_of_ray: dict[str, str]) -> Iterator[ServiceProcess]:
     """Two replicas on a local cluster; `ray` in its line `ready` is the cluster's address."""
     port = str(_free_port())
     command = [sys.executable, "-m", "service.deploy.ray", "--min-replicas", "2", "--cpus", "0.1"]
-    with running_service(command, {**settings_of_ray, "GRASP_PORT": port}) as service:
+    with running_service(command, {**settings_of_ray, "GRASP_PORT": port}, OnRay) as service:
         service.wait_for("ready")
         yield service
 
@@ -117,20 +124,6 @@ def test_scenes_are_labelled_the_same_on_a_cluster(
                 assert {key: one[key].tobytes() for key in one} == {key: other[key].tobytes() for key in other}
         else:
             assert without_times(json.loads(here.read_text())) == without_times(json.loads(there.read_text()))
-
-
-def test_a_cluster_that_is_not_there_is_named(tmp_path: Path, settings_of_ray: dict[str, str]) -> None:
-    done = subprocess.run(
-        [sys.executable, "-m", "simharness", "--rounds", "1", "--url", "http://127.0.0.1:9", "--ray", "nowhere"],
-        cwd=tmp_path,
-        env={**os.environ, **settings_of_ray, "PYTHONPATH": str(ROOT)},
-        capture_output=True,
-        text=True,
-        timeout=300,
-        check=False,
-    )
-    assert done.returncode in (2, 3)
-    assert "Traceback" not in done.stderr
 
 
 def test_a_killed_replica_loses_no_request_and_sigterm_ends_in_order(served: ServiceProcess) -> None:

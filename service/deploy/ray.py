@@ -12,13 +12,15 @@ import logging
 import os
 import signal
 import sys
+import time
 from collections.abc import AsyncIterator, Iterator, Mapping
 from concurrent.futures import Future
-from contextlib import asynccontextmanager, contextmanager
+from contextlib import asynccontextmanager, contextmanager, suppress
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
 import anyio.to_thread
+import httpx
 from pydantic import ValidationError
 from starlette.datastructures import MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
@@ -37,6 +39,10 @@ LOCAL = "local"
 
 NAME = "grasps"
 """Of the application and its one deployment."""
+
+READY_WITHIN_S = 300.0
+
+LOGS = "/tmp/ray/session_latest/logs/serve"  # noqa: S108 - where Ray writes them
 
 TRIES_TO_START = 3
 """Starts of a replica that fail, for instance over missing weights, before the application counts as failed."""
@@ -159,8 +165,6 @@ def main() -> int:
             return _serve(settings, replicas, own_cluster=address == LOCAL)
     except InvalidSetting as error:
         return _fail(str(error), 2)
-    except ConnectionError as error:
-        return _fail(f"--address {address}: {error}", 1)
 
 
 def replicas_from(options: Mapping[str, Any]) -> Replicas:
@@ -208,24 +212,45 @@ def _serve(settings: Settings, replicas: Replicas, *, own_cluster: bool) -> int:
 
     url = f"http://{settings.host}:{settings.port}"
     try:
-        serve.start(
-            proxy_location="EveryNode",
-            http_options={"host": settings.host, "port": settings.port, "keep_alive_timeout_s": KEEP_ALIVE_SECONDS},
-        )
-        serve.run(application(replicas), name=NAME)
-        fields = {"url": url, "ray": ray.get_runtime_context().gcs_address, "pid": os.getpid()}
-        log.info("ready", extra={"fields": {**fields, **replicas.model_dump()}})
-        signal.pause()
+        # Serve waits a minute for its proxy and no longer, while on a busy machine all is well and merely slow.
+        with suppress(TimeoutError):
+            serve.start(
+                proxy_location="EveryNode",
+                http_options={"host": settings.host, "port": settings.port, "keep_alive_timeout_s": KEEP_ALIVE_SECONDS},
+            )
+        try:
+            with suppress(TimeoutError):
+                serve.run(application(replicas), name=NAME)
+            _await_ready(url)
+            fields = {"url": url, "ray": ray.get_runtime_context().gcs_address, "pid": os.getpid()}
+            log.info("ready", extra={"fields": {**fields, **replicas.model_dump()}})
+            signal.pause()
+        finally:
+            serve.delete(NAME)
     except KeyboardInterrupt:
-        log.info("draining")
-    except RuntimeError as error:
+        log.info("stopped")
+    except (RuntimeError, TimeoutError) as error:
         return _fail(str(error), 1)
     finally:
-        serve.delete(NAME)
         if own_cluster:
             serve.shutdown()
-    log.info("stopped")
     return 0
+
+
+def _await_ready(url: str) -> None:
+    """Returns when the proxy answers for a replica.
+
+    Raises:
+        TimeoutError: it does not.
+    """
+    deadline = time.monotonic() + READY_WITHIN_S
+    with httpx.Client(base_url=url, timeout=10.0, trust_env=False) as http:
+        while time.monotonic() < deadline:
+            with suppress(httpx.TransportError):
+                if http.get("/health/ready").status_code == httpx.codes.OK:
+                    return
+            time.sleep(0.1)
+    raise TimeoutError(f"{url} was not ready after {READY_WITHIN_S:.0f} s; Serve's logs are in {LOGS}")
 
 
 @contextmanager
@@ -233,14 +258,19 @@ def _cluster(address: str) -> Iterator[None]:
     """Connected to a Ray cluster; one that is started here listens on the loopback interface alone.
 
     Raises:
-        ConnectionError: there is no cluster at the address.
+        InvalidSetting: there is no cluster at the address.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address == LOCAL:
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # to Ray this means: one machine, 127.0.0.1
+        # A proxy that is slow to start on a busy machine is replaced after three of these, and never gets there.
+        os.environ.setdefault("RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S", "60")
     import ray  # noqa: PLC0415 - reads the environment when it is loaded
 
-    ray.init(address=address, include_dashboard=False if address == LOCAL else None)
+    try:
+        ray.init(address=address, include_dashboard=False if address == LOCAL else None)
+    except (ConnectionError, ValueError) as error:
+        raise InvalidSetting("--address", f"is {address!r}, where no cluster answers: {error}") from error
     try:
         yield
     finally:
