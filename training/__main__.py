@@ -77,6 +77,7 @@ def _add_generate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--camera", choices=get_args(Preset), default="random")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=_positive, default=1)
+    parser.add_argument("--ray", metavar="ADDRESS", help="make the scenes on this Ray cluster")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--resume", action="store_true", help="go on where an earlier run stopped")
     parser.set_defaults(run=_generate)
@@ -94,7 +95,7 @@ def _generate(options: argparse.Namespace) -> dict[str, object]:
         mine=options.mine,
         camera=options.camera,
     )
-    return generate(config, options.labels, options.workers, options.out, options.resume)
+    return generate(config, options.labels, options.workers, options.out, options.resume, options.ray)
 
 
 def _add_pack(parser: argparse.ArgumentParser) -> None:

@@ -49,7 +49,7 @@ class Recipe:
     weight_decay: float = 1e-4
     patience: int = 2
     smallest_learning_rate: float = 5e-5
-    max_epochs: int = 9
+    max_epochs: int = 10
     cosine: bool = True
     views_per_step: int = 4
     candidates_per_view: int = 120

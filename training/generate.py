@@ -7,12 +7,14 @@ from __future__ import annotations
 
 import json
 import math
-import multiprocessing
 import os
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
@@ -21,6 +23,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from simharness.camera import Observation, Preset, observe
+from simharness.crew import Done, Emit, Event, Work, crew
 from simharness.execute import label_strict, snapshot_of
 from simharness.hand import Hand
 from simharness.objects import ObjectModel, load_object_set
@@ -33,6 +36,8 @@ from tesnet.networks import Network
 from tesnet.predictor import APPROACH_DISTANCE
 from tesnet.query import GraspQuery
 from training.views import OUTCOMES, LabelledView, LabelsError, pairs_of, save_scene, scene_files
+
+_HEAR_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -64,11 +69,22 @@ class GenerateConfig:
     camera: Preset = "random"
 
 
-def generate(config: GenerateConfig, labels: int, workers: int, out: Path, resume: bool = False) -> dict[str, Any]:
+def generate(
+    config: GenerateConfig, labels: int, workers: int, out: Path, resume: bool = False, ray: str | None = None
+) -> dict[str, Any]:
     """Writes scenes to `out` until they hold `labels` labels; returns and stores the account of what is there.
+
+    Args:
+        config: what is generated.
+        labels: how many.
+        workers: how many scenes are made at a time.
+        out: folder for the scenes.
+        resume: whether to go on with what `out` holds.
+        ray: address of a Ray cluster that makes the scenes; None for processes on this machine.
 
     Raises:
         LabelsError: `out` holds scenes and `resume` is not set, or scenes of another configuration.
+        SimError: there is no such cluster, or a worker failed.
     """
     out.mkdir(parents=True, exist_ok=True)
     settings = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(config).items()}
@@ -81,21 +97,25 @@ def generate(config: GenerateConfig, labels: int, workers: int, out: Path, resum
             counts += stored["counts"]
     started, fresh, busy_s = time.monotonic(), 0, 0.0
     pending = (number for number in range(10**9) if number not in done)
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(workers, _start_worker, (config, out)) as pool, tqdm(total=labels, unit="label") as progress:
+    with crew(_Scenes(config), workers, ray) as makers, tqdm(total=labels, unit="label") as progress:
         progress.update(int(counts.sum()))
-        jobs: list[Any] = []
-        while counts.sum() < labels:
-            while len(jobs) < 2 * workers:
-                jobs.append(pool.apply_async(_make_scene_file, (next(pending),)))
-            scene_counts, seconds = jobs.pop(0).get()
-            counts += scene_counts
-            fresh += int(scene_counts.sum())
-            busy_s += seconds
-            progress.update(int(scene_counts.sum()))
+        given: deque[int] = deque()
+        made: dict[int, _Made] = {}
+        while True:
+            while counts.sum() < labels and len(given) < 2 * workers:
+                given.append(next(pending))
+                makers.give(given[-1])
+            if not given:
+                break
+            # One scene at a time and in their order, so that which ones are made depends on no worker's speed.
+            while given[0] not in made:
+                made |= _made(makers.hear(_HEAR_S), out)
+            scene = made.pop(given.popleft())
+            counts += scene.counts
+            fresh += int(scene.counts.sum())
+            busy_s += scene.seconds
+            progress.update(int(scene.counts.sum()))
             progress.set_postfix(success=f"{counts[0] / max(1, counts.sum()):.3f}")
-        for job in jobs:
-            counts += job.get()[0]
     account = {
         "settings": settings,
         "labels": int(counts.sum()),
@@ -133,35 +153,60 @@ def object_sets(config: GenerateConfig) -> list[tuple[ObjectModel, ...]]:
     return [load_object_set(name, config.scene, exclude=config.exclude) for name in config.objects.split(",")]
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class _Made:
+    """A labelled scene: its file's content, the counts of its outcomes, and the seconds it took."""
+
+    content: bytes
+    counts: np.ndarray[Any, np.dtype[np.int64]]
+    seconds: float
+
+
 @dataclass(frozen=True, slots=True)
-class _Worker:
-    """What a worker process keeps between its scenes."""
+class _Scenes:
+    """What a worker needs to make any scene."""
 
     config: GenerateConfig
-    out: Path
-    sets: Sequence[tuple[ObjectModel, ...]]
-    network: Network | None
+
+    def name(self, job: int) -> str:
+        """A scene in words."""
+        return f"scene {job}"
+
+    @contextmanager
+    def begin(self) -> Iterator[Work[int]]:
+        """The object sets, and what makes scenes of them."""
+        os.nice(10)
+        torch.set_num_threads(1)
+        sets = object_sets(self.config)
+        network = None if self.config.mine is None else networks.load(self.config.mine)[0]
+
+        def make(number: int, _: Emit) -> _Made:
+            started = time.monotonic()
+            description, views = label_scene(self.config, sets, number, network)
+            counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+            for view in views:
+                counts += np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES))
+            with TemporaryDirectory(prefix="scene-") as folder:
+                path = Path(folder) / _file_name(number)
+                save_scene(path, description, views, counts)
+                return _Made(path.read_bytes(), counts, time.monotonic() - started)
+
+        yield make
 
 
-_worker: _Worker
+def _made(heard: Sequence[Event | Done[int]], out: Path) -> dict[int, _Made]:
+    """The scenes among what was heard, by number; each is on the disk, as the whole file, when this returns."""
+    scenes: dict[int, _Made] = {message.job: message.result for message in heard if isinstance(message, Done)}
+    for number, scene in scenes.items():
+        path = out / _file_name(number)
+        draft = path.with_name(f".{path.name}.{os.getpid()}")
+        draft.write_bytes(scene.content)
+        draft.replace(path)
+    return scenes
 
 
-def _start_worker(config: GenerateConfig, out: Path) -> None:
-    global _worker  # noqa: PLW0603  a pool's initializer has no other way to hand state to its jobs
-    os.nice(10)
-    torch.set_num_threads(1)
-    _worker = _Worker(config, out, object_sets(config), None if config.mine is None else networks.load(config.mine)[0])
-
-
-def _make_scene_file(number: int) -> tuple[np.ndarray[Any, np.dtype[np.int64]], float]:
-    """Labels scene `number` and writes it; counts of the outcomes, and the seconds it took."""
-    started = time.monotonic()
-    description, views = label_scene(_worker.config, _worker.sets, number, _worker.network)
-    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
-    for view in views:
-        counts += np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES))
-    save_scene(_worker.out / f"scene_{number:07d}.npz", description, views, counts)
-    return counts, time.monotonic() - started
+def _file_name(number: int) -> str:
+    return f"scene_{number:07d}.npz"
 
 
 def label_scene(
