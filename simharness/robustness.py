@@ -68,7 +68,7 @@ AXES: Mapping[AxisName, Axis] = {
             Condition("unchanged", "0.8 mm"),
             Condition("noise-2mm", "2 mm", {"noise_std": 0.002}),
             Condition("noise-4mm", "4 mm", {"noise_std": 0.004}),
-            Condition("noise-giga", "giga's on depth", {"noise_std": 0.0, "dex_noise": True}),
+            Condition("noise-giga", "giga's", {"noise_std": 0.0, "dex_noise": True}),
         ),
         joined=4,
     ),
@@ -150,7 +150,7 @@ class Study:
 
     def table(self) -> str:
         """The rates in Markdown, one table for each axis."""
-        lines = [f"{self._title}, {self._settings.rounds} rounds for each seed and condition; 95 % Wilson intervals."]
+        lines = [f"{self._title}; rounds for each seed and condition: {self._settings.rounds}; 95 % Wilson intervals."]
         if not self._complete:
             lines += ["", f"Incomplete: {len(self._runs)} of {len(self._conditions)} conditions."]
         for axis in self._axes.values():
