@@ -1,4 +1,7 @@
-"""`python -m simharness`: clear tables through the service and count; `replay` shows one attempt again.
+"""`python -m simharness`: clear tables through the service and count.
+
+`replay` shows one attempt again, `failures` sorts failed attempts by cause, `robustness` repeats a run under worse
+sensing.
 
 Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker failed in mid-run,
 what was done is kept; 130 and 143 stopped by Ctrl-C and by SIGTERM.
@@ -22,14 +25,16 @@ from tqdm import tqdm
 from simharness.camera import PRESETS
 from simharness.errors import RunBroken, SimError, UsageError
 from simharness.execute import Executor
-from simharness.folder import PAGE_FILE, REPORT_FILE, RunFolder
+from simharness.failures import failures, failures_report, failures_table
+from simharness.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
 from simharness.metrics import summarise
-from simharness.objects import SceneKind, load_object_set
+from simharness.objects import ObjectModel, SceneKind, load_object_set
 from simharness.page import page
 from simharness.photographer import attempts_to_show, keep_only, take_pictures
 from simharness.records import RoundRecord, RunSettings
 from simharness.replay import find_attempt, replay
 from simharness.report import package_versions, percent, report, table
+from simharness.robustness import AXIS_NAMES, JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
 from simharness.run import Hooks, Run, run
 
 if TYPE_CHECKING:
@@ -37,6 +42,11 @@ if TYPE_CHECKING:
 
 EXIT_USAGE = 2
 EXIT_BROKEN = 3
+
+_EXIT_CODES = (
+    "Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker failed, and "
+    "what was done is kept for --resume."
+)
 
 DEFAULT_OBJECTS: dict[SceneKind, str] = {"packed": "procedural", "pile": "pybullet-random"}
 DEFAULT_WORKERS = min(2, os.cpu_count() or 1)
@@ -48,8 +58,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out a command line; the exit code."""
     given = list(sys.argv[1:] if arguments is None else arguments)
     try:
-        if given[:1] == ["replay"]:
-            return _replay(_replay_parser().parse_args(given[1:]))
+        for name, parser, carry_out in _COMMANDS:
+            if given[:1] == [name]:
+                return carry_out(parser().parse_args(given[1:]))
         return _run(_run_parser().parse_args(given))
     except RunBroken as error:
         return _fail(error, EXIT_BROKEN)
@@ -66,8 +77,31 @@ def _fail(error: SimError, code: int) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     settings = _settings(options)
-    objects = load_object_set(settings.objects, settings.scene, _path(settings.exclude), _path(settings.only))
-    folder = RunFolder(options.out or _default_out(settings))
+    _, code = _clear(options, settings, RunFolder(options.out or _default_out(settings)))
+    return code
+
+
+def _robustness(options: argparse.Namespace) -> int:
+    settings = _settings(options)
+    folder = RunFolder(options.out or _default_out(settings, "robustness-"))
+    study = Study(settings, options.against)
+    code = 0
+    for condition in conditions(options.against):
+        print(f"\n{condition.name}", flush=True)
+        result, code = _clear(options, condition.settings(settings), RunFolder(folder.path / condition.name))
+        if code:
+            break
+        study.add(condition, result)
+    folder.write_json(JSON_FILE, study.report(package_versions()))
+    folder.write_text(TABLE_FILE, study.table())
+    folder.write_text(PLOT_FILE, study.plot())
+    print(f"\n{study.table()}\nplot      {folder.path / PLOT_FILE}")
+    return code
+
+
+def _clear(options: argparse.Namespace, settings: RunSettings, folder: RunFolder) -> tuple[Run, int]:
+    """Carry a run out, leave its reports, print its table; the run and the exit code."""
+    objects = _objects(settings)
     signals = _Signals()
     with ExitStack() as stack:
         progress = _Progress(settings)
@@ -96,11 +130,11 @@ def _run(options: argparse.Namespace) -> int:
     print(table(result))
     print(f"report    {folder.path / PAGE_FILE}")
     if signals.caught is not None:
-        return 128 + signals.caught
+        return result, 128 + signals.caught
     if result.stopped_by is not None:
         print(f"simharness: {result.stopped_by}", file=sys.stderr)
-        return EXIT_BROKEN
-    return 0
+        return result, EXIT_BROKEN
+    return result, 0
 
 
 def _leave(result: Run, folder: RunFolder) -> None:
@@ -118,9 +152,9 @@ def _replay(options: argparse.Namespace) -> int:
     settings, _, _ = folder.read_run()
     rounds = folder.read_rounds()
     recorded = find_attempt(rounds, options.attempt)
-    objects = load_object_set(settings.objects, settings.scene, _path(settings.exclude), _path(settings.only))
+    objects = _objects(settings)
     played = next(record for record in rounds if (record.seed, record.round) == (recorded.seed, recorded.round))
-    event = replay(settings, objects, played, recorded.attempt)
+    event = replay(settings, objects, played, recorded.attempt)[-1]
     target = folder.path / f"replay-{options.attempt}"
     target.mkdir(exist_ok=True)
     print(f"attempt {options.attempt}: seed {recorded.seed}, round {recorded.round}, its attempt {recorded.attempt}")
@@ -133,15 +167,73 @@ def _replay(options: argparse.Namespace) -> int:
     return 0
 
 
+def _failures(options: argparse.Namespace) -> int:
+    folder = RunFolder(options.folder)
+    settings, _, _ = folder.read_run()
+    rounds = folder.read_rounds()
+    attempts = [attempt for record in rounds for attempt in record.attempts]
+    failed = sum(not attempt.success for attempt in attempts)
+    found = list(
+        tqdm(
+            failures(settings, _objects(settings), rounds, options.limit),
+            total=min(failed, options.limit),
+            unit="failure",
+            file=sys.stderr,
+            dynamic_ncols=True,
+        )
+    )
+    content = failures_report(found, len(attempts), failed)
+    folder.write_json(FAILURES_FILE, content)
+    print(failures_table(content))
+    return 0
+
+
 def _run_parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m simharness",
-        description="Clear simulated tables through the grasp service and report success rates. "
-        "`python -m simharness replay DIR --attempt K` shows one attempt again.",
-        epilog="Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker "
-        "failed, and what was done is kept for --resume.",
+        description="Clear simulated tables through the grasp service and report success rates. Other commands: "
+        "`replay DIR --attempt K` shows one attempt again, `failures DIR` sorts failed attempts by cause, `robustness` "
+        "repeats a run under worse sensing; each has --help.",
+        epilog=_EXIT_CODES,
         allow_abbrev=False,
     )
+    _add_run_options(parser)
+    _add_camera_options(parser)
+    add = parser.add_argument
+    add("--watch", action="store_true", help="show the run live in a browser page; plays with one worker")
+    add(
+        "--watch-port",
+        type=_port,
+        default=8080,
+        metavar="PORT",
+        help="port of that page; the next free one is taken (default %(default)s)",
+    )
+    return parser
+
+
+def _robustness_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m simharness robustness",
+        description="Play the same rounds, seen by camera `random`, under noise, from other viewpoints and with fewer "
+        f"points; leaves a run for each condition and {TABLE_FILE}, {PLOT_FILE} and {JSON_FILE}.",
+        epilog=_EXIT_CODES,
+        allow_abbrev=False,
+    )
+    _add_run_options(parser)
+    unchanged = {"camera": "random", "watch": False}
+    changed = dict.fromkeys(("noise_std", "depth_noise_std", "dex_noise", "polar_deg", "voxel_size"))
+    parser.set_defaults(**unchanged, **changed)
+    parser.add_argument(
+        "--against",
+        nargs="+",
+        choices=AXIS_NAMES,
+        default=AXIS_NAMES,
+        help="what is made worse (default: everything)",
+    )
+    return parser
+
+
+def _add_run_options(parser: argparse.ArgumentParser) -> None:
     add = parser.add_argument
     add("--rounds", type=_at_least(1), default=100, metavar="N", help="rounds for each seed (default %(default)s)")
     add(
@@ -158,20 +250,6 @@ def _run_parser() -> argparse.ArgumentParser:
     )
     add("--exclude", metavar="LIST", help="file with names of objects to leave out")
     add("--only", metavar="LIST", help="file with names of objects to use alone")
-    add(
-        "--camera",
-        choices=PRESETS,
-        default="random",
-        help="random: one view from somewhere above; giga: one fixed view from the side; multi3: three views; "
-        "vgn6: six views (default %(default)s)",
-    )
-    add(
-        "--noise-std",
-        type=_not_negative,
-        metavar="M",
-        help="noise on each coordinate of each point, metres (default: the camera's)",
-    )
-    add("--depth-noise-std", type=_not_negative, metavar="M", help="noise on depth, metres (default: the camera's)")
     add(
         "--executor",
         choices=get_args(Executor),
@@ -198,15 +276,41 @@ def _run_parser() -> argparse.ArgumentParser:
     )
     add("--out", type=Path, metavar="DIR", help="where the reports go (default: a new folder in runs/)")
     add("--resume", action="store_true", help="continue the run in --out")
-    add("--watch", action="store_true", help="show the run live in a browser page; plays with one worker")
+
+
+def _add_camera_options(parser: argparse.ArgumentParser) -> None:
+    add = parser.add_argument
     add(
-        "--watch-port",
-        type=_port,
-        default=8080,
-        metavar="PORT",
-        help="port of that page; the next free one is taken (default %(default)s)",
+        "--camera",
+        choices=PRESETS,
+        default="random",
+        help="random: one view from somewhere above; giga: one fixed view from the side; multi3: three views; "
+        "vgn6: six views (default %(default)s)",
     )
-    return parser
+    add(
+        "--noise-std",
+        type=_not_negative,
+        metavar="M",
+        help="noise on each coordinate of each point, metres (default: the camera's)",
+    )
+    add("--depth-noise-std", type=_not_negative, metavar="M", help="noise on depth, metres (default: the camera's)")
+    add(
+        "--dex-noise",
+        action=argparse.BooleanOptionalAction,
+        help="the depth noise that camera giga has (default: the camera's)",
+    )
+    add(
+        "--polar-deg",
+        type=_between(0, 90, "degrees"),
+        metavar="DEG",
+        help="angle of the views from straight above (default: the camera's)",
+    )
+    add(
+        "--voxel-size",
+        type=_between(0, 1, "metres"),
+        metavar="M",
+        help="thin the cloud to one point for each voxel of this edge, metres (default: every point is sent)",
+    )
 
 
 def _replay_parser() -> argparse.ArgumentParser:
@@ -222,6 +326,25 @@ def _replay_parser() -> argparse.ArgumentParser:
         help="which attempt: line of attempts.jsonl, the first is 0",
     )
     return parser
+
+
+def _failures_parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m simharness failures",
+        description=f"Replay failed attempts of a run and sort them by cause; leaves {FAILURES_FILE} in its folder.",
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="the --out of a run")
+    parser.add_argument(
+        "--limit", type=_at_least(1), default=50, metavar="N", help="so many, the earliest (default %(default)s)"
+    )
+    return parser
+
+
+_COMMANDS = (
+    ("replay", _replay_parser, _replay),
+    ("failures", _failures_parser, _failures),
+    ("robustness", _robustness_parser, _robustness),
+)
 
 
 def _settings(options: argparse.Namespace) -> RunSettings:
@@ -245,7 +368,14 @@ def _settings(options: argparse.Namespace) -> RunSettings:
         executor=options.executor,
         model=options.model,
         max_grasps=MAX_GRASPS_WATCHED if options.watch else 1,
+        dex_noise=options.dex_noise,
+        polar_deg=options.polar_deg,
+        voxel_size=options.voxel_size,
     )
+
+
+def _objects(settings: RunSettings) -> tuple[ObjectModel, ...]:
+    return load_object_set(settings.objects, settings.scene, _path(settings.exclude), _path(settings.only))
 
 
 def _absolute(name: str | None) -> Any:
@@ -257,9 +387,9 @@ def _path(name: str | None) -> Path | None:
     return None if name is None else Path(name)
 
 
-def _default_out(settings: RunSettings) -> Path:
+def _default_out(settings: RunSettings, prefix: str = "") -> Path:
     now = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
-    return Path("runs") / f"{settings.scene}-{settings.executor}-{now}"
+    return Path("runs") / f"{prefix}{settings.scene}-{settings.executor}-{now}"
 
 
 def _at_least(minimum: int) -> Any:
@@ -290,6 +420,21 @@ def _not_negative(text: str) -> float:
     if not 0 <= value < 1:
         raise argparse.ArgumentTypeError(f"{text} is out of range; give metres, 0 or more and less than 1")
     return value
+
+
+def _between(low: float, high: float, unit: str) -> Any:
+    def parse(text: str) -> float:
+        try:
+            value = float(text)
+        except ValueError:
+            raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
+        if not low < value < high:
+            raise argparse.ArgumentTypeError(
+                f"{text} is out of range; give {unit}, more than {low:g} and less than {high:g}"
+            )
+        return value
+
+    return parse
 
 
 class _Progress:

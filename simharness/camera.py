@@ -99,26 +99,35 @@ class Observation:
             object.__setattr__(self, name, array)
 
 
-def sample_camera(preset: Preset, rng: np.random.Generator) -> tuple[Pose, ...]:
+def sample_camera(preset: Preset, rng: np.random.Generator, polar_deg: float | None = None) -> tuple[Pose, ...]:
     """T_world_camera of each view of a preset.
 
     `random`: one view on a sphere about (0.15, 0.15, 0.25), radius 0.6-0.75 m, polar angle 45-60 deg, azimuth 0-180
     deg. `giga`: one fixed view from the side. `multi3`: three views like `random`'s, 120 deg apart, azimuth of the
     first 0-120 deg. `vgn6`: six views on a circle, polar angle 30 deg, radius 0.6 m.
 
+    Args:
+        preset: which views.
+        rng: source of what is random about them.
+        polar_deg: replaces the polar angle of every view, more than 0 and at most 90; the rest stays as it was.
+
     Raises:
         ValueError: an unknown preset; the message lists the valid ones.
     """
+
+    def on_sphere(centre: tuple[float, float, float], radius: float, polar: float, azimuth: float) -> Pose:
+        return _on_sphere(centre, radius, polar if polar_deg is None else polar_deg, azimuth)
+
     if preset == "random":
         radius, polar, azimuth = rng.uniform(0.6, 0.75), rng.uniform(45, 60), rng.uniform(0, 180)
-        return (_on_sphere((0.15, 0.15, 0.25), radius, polar, azimuth),)
+        return (on_sphere((0.15, 0.15, 0.25), radius, polar, azimuth),)
     if preset == "giga":
-        return (_on_sphere((0.15, 0.15, 0.1), 0.6, 60, -90),)
+        return (on_sphere((0.15, 0.15, 0.1), 0.6, 60, -90),)
     if preset == "multi3":
         radius, polar, azimuth = rng.uniform(0.6, 0.75), rng.uniform(45, 60), rng.uniform(0, 120)
-        return tuple(_on_sphere((0.15, 0.15, 0.25), radius, polar, azimuth + turn) for turn in (0, 120, 240))
+        return tuple(on_sphere((0.15, 0.15, 0.25), radius, polar, azimuth + turn) for turn in (0, 120, 240))
     if preset == "vgn6":
-        return tuple(_on_sphere((0.15, 0.15, 0.0), 0.6, 30, azimuth) for azimuth in range(0, 360, 60))
+        return tuple(on_sphere((0.15, 0.15, 0.0), 0.6, 30, azimuth) for azimuth in range(0, 360, 60))
     raise ValueError(f"unknown camera preset {preset!r}; valid: {', '.join(PRESETS)}")
 
 
@@ -142,7 +151,14 @@ def render(world: World, T_world_camera: Pose, *, segmentation: bool = True) -> 
 
 
 def observe(
-    world: World, preset: Preset, rng: np.random.Generator, noise: Noise | None = None, *, segmentation: bool = False
+    world: World,
+    preset: Preset,
+    rng: np.random.Generator,
+    noise: Noise | None = None,
+    *,
+    polar_deg: float | None = None,
+    voxel_size: float | None = None,
+    segmentation: bool = False,
 ) -> Observation:
     """Sample a camera and look: depth, depth noise, points, crop to the perception box, point noise, in this order.
 
@@ -153,10 +169,13 @@ def observe(
         preset: where cameras stand.
         rng: source of the cameras' poses, then of the noise.
         noise: the preset's own unless given.
+        polar_deg: replaces the preset's polar angle.
+        voxel_size: edge of the voxels to which the cloud is thinned at last, metres; None keeps every point.
         segmentation: whether the images shall hold body ids.
     """
-    cameras = sample_camera(preset, rng)
-    return observe_from(world, cameras, rng, noise or PRESET_NOISE[preset], segmentation=segmentation)
+    cameras = sample_camera(preset, rng, polar_deg)
+    noise = noise or PRESET_NOISE[preset]
+    return observe_from(world, cameras, rng, noise, voxel_size=voxel_size, segmentation=segmentation)
 
 
 def observe_from(
@@ -165,6 +184,7 @@ def observe_from(
     rng: np.random.Generator,
     noise: Noise,
     *,
+    voxel_size: float | None = None,
     segmentation: bool = False,
 ) -> Observation:
     """`observe` from given poses T_world_camera; several views are fused into one cloud."""
@@ -175,6 +195,8 @@ def observe_from(
     points = crop(points, PERCEPTION_BOX)
     if noise.point_sigma > 0:
         points = points + rng.normal(0.0, noise.point_sigma, points.shape)
+    if voxel_size is not None:
+        points = thin(points, voxel_size)
     return Observation(
         points.astype(np.float32),
         np.stack([camera.translation for camera in cameras]),
@@ -203,6 +225,20 @@ def add_depth_noise(
 def crop(points: Float64[np.ndarray, "points 3"], box: Box) -> Float64[np.ndarray, "inside 3"]:
     """The points inside a box."""
     return np.asarray(points[((points >= box.minimum) & (points <= box.maximum)).all(axis=1)])
+
+
+def thin(points: Float64[np.ndarray, "points 3"], voxel_size: float) -> Float64[np.ndarray, "voxels 3"]:
+    """The mean of the points in each voxel that holds any, ordered by voxel.
+
+    Args:
+        points: metres.
+        voxel_size: edge of the voxels, metres; one has a corner at the origin.
+    """
+    cells = np.floor(points / voxel_size).astype(np.int64)
+    _, members, counts = np.unique(cells, axis=0, return_inverse=True, return_counts=True)
+    sums = np.zeros((len(counts), 3))
+    np.add.at(sums, members.reshape(-1), points)
+    return np.asarray(sums / counts[:, None])
 
 
 def _on_sphere(centre: tuple[float, float, float], radius: float, polar_deg: float, azimuth_deg: float) -> Pose:

@@ -11,14 +11,14 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from contextlib import contextmanager
-from dataclasses import dataclass
+from dataclasses import dataclass, field
 from typing import Literal
 
 import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from simharness.hand import MAX_WIDTH, Hand, Placement, placements
+from simharness.hand import MAX_WIDTH, Hand, HandContact, Placement, placements
 from simharness.scene import settle
 from simharness.world import TIMESTEP, World
 from tesnet.geometry import Pose
@@ -53,8 +53,29 @@ _WAY_FRACTIONS = (0.0, 0.5, 0.25, 0.75, 0.125, 0.375, 0.625, 0.875)
 
 
 @dataclass(frozen=True, slots=True)
+class Grip:
+    """What closing the fingers led to.
+
+    Args:
+        touched: ids of the objects that touch the hand.
+        pinched: ids of those that touch both fingers.
+        empty: the fingers met.
+    """
+
+    touched: frozenset[int]
+    pinched: frozenset[int]
+    empty: bool
+
+    def held(self, executor: Executor) -> frozenset[int]:
+        """Ids of the objects that count as held."""
+        if self.empty:
+            return frozenset()
+        return self.touched if executor == "edge" else self.pinched
+
+
+@dataclass(frozen=True, slots=True)
 class Outcome:
-    """What became of an attempt.
+    """What became of an attempt, and the evidence, which is left out when outcomes are compared.
 
     Args:
         kind: `success`, or how it failed: contact at the start pose, contact on the way, nothing held after closing,
@@ -63,6 +84,8 @@ class Outcome:
         contact_at_start: the hand touched something where it appeared.
         contact_on_way: it touched something between there and the grasp.
         lost: ids of objects that left the workspace otherwise, and were removed.
+        first_contact: the deepest contact when the hand first touched something before closing, or None.
+        closed: the grip before the retreat; None when the fingers were never closed.
     """
 
     kind: OutcomeKind
@@ -70,6 +93,8 @@ class Outcome:
     contact_at_start: bool
     contact_on_way: bool
     lost: tuple[int, ...] = ()
+    first_contact: HandContact | None = field(default=None, compare=False)
+    closed: Grip | None = field(default=None, compare=False)
 
 
 @dataclass(frozen=True, slots=True)
@@ -86,23 +111,9 @@ class Labels:
 
 
 @dataclass(frozen=True, slots=True)
-class _Grip:
-    """Objects touched by the hand, objects touched by both fingers, and whether the fingers met."""
-
-    touched: frozenset[int]
-    pinched: frozenset[int]
-    empty: bool
-
-    def held(self, executor: Executor) -> frozenset[int]:
-        if self.empty:
-            return frozenset()
-        return self.touched if executor == "edge" else self.pinched
-
-
-@dataclass(frozen=True, slots=True)
 class _Lift:
-    closed: _Grip
-    lifted: _Grip
+    closed: Grip
+    lifted: Grip
 
     def kind(self, executor: Executor) -> OutcomeKind:
         if self.lifted.held(executor) and self.closed.held(executor):
@@ -110,7 +121,7 @@ class _Lift:
         return "drop" if self.closed.held(executor) else "slip"
 
 
-_NOTHING = _Grip(frozenset(), frozenset(), empty=True)
+_NOTHING = Grip(frozenset(), frozenset(), empty=True)
 
 
 def attempt(world: World, hand: Hand, T_world_grasp: NDArray[np.float64], width: float, executor: Executor) -> Outcome:
@@ -124,16 +135,16 @@ def attempt(world: World, hand: Hand, T_world_grasp: NDArray[np.float64], width:
         executor: which rules apply.
     """
     grasp = placements(np.asarray(T_world_grasp, dtype=np.float64)[None], [width])[0]
-    at_start = _touches(world, hand, grasp, PREGRASP_DISTANCE)
-    if executor == "strict" and at_start:
-        return _finish(world, hand, "pregrasp", frozenset(), contact_at_start=True, contact_on_way=False)
+    at_start = hand.deepest_contact() if _touches(world, hand, grasp, PREGRASP_DISTANCE) else None
+    if executor == "strict" and at_start is not None:
+        return _finish(world, hand, "pregrasp", at_start, None)
     on_way = _approach(world, hand, grasp, stop_at_contact=executor == "strict")
-    if executor == "strict" and on_way:
-        return _finish(world, hand, "approach", frozenset(), contact_at_start=False, contact_on_way=True)
+    if executor == "strict" and on_way is not None:
+        return _finish(world, hand, "approach", None, on_way)
     lift = _close_and_lift(world, hand, grasp, executor, full_retreat=True)
     kind = lift.kind(executor)
     grasped: frozenset[int] = lift.lifted.held(executor) if kind == "success" else frozenset()
-    return _finish(world, hand, kind, grasped, contact_at_start=at_start, contact_on_way=on_way)
+    return _finish(world, hand, kind, at_start, on_way, lift.closed, grasped)
 
 
 def label_strict(
@@ -215,19 +226,19 @@ def _first_contact(world: World, hand: Hand, grasp: Placement) -> Literal["pregr
     return None
 
 
-def _approach(world: World, hand: Hand, grasp: Placement, *, stop_at_contact: bool) -> bool:
-    """Move from the start pose to the grasp in physics; whether the hand touched anything on the way."""
+def _approach(world: World, hand: Hand, grasp: Placement, *, stop_at_contact: bool) -> HandContact | None:
+    """Move from the start pose to the grasp in physics; what the hand touched first on the way."""
     hand.place_behind(grasp, PREGRASP_DISTANCE)
     hand.hold_open(grasp.width)
-    touched = False
+    first: HandContact | None = None
     steps = round(PREGRASP_DISTANCE / _STEP_LENGTH)
     for step in range(1, steps + _ARRIVAL_STEPS + 1):
         hand.carry_to(grasp, behind=max(0.0, PREGRASP_DISTANCE - step * _STEP_LENGTH))
         world.step()
-        touched = touched or hand.touches_anything()
-        if touched and stop_at_contact:
-            return True
-    return touched
+        first = first or hand.deepest_contact()
+        if first is not None and stop_at_contact:
+            break
+    return first
 
 
 def _close_and_lift(world: World, hand: Hand, grasp: Placement, executor: Executor, *, full_retreat: bool) -> _Lift:
@@ -268,10 +279,10 @@ def _close_and_lift(world: World, hand: Hand, grasp: Placement, executor: Execut
     return _Lift(closed, _grip(world, hand))
 
 
-def _grip(world: World, hand: Hand) -> _Grip:
+def _grip(world: World, hand: Hand) -> Grip:
     touched, pinched = hand.touched(within=TOUCHING)
     objects = frozenset(world.objects)
-    return _Grip(objects & touched, objects & pinched, empty=hand.width <= EMPTY_WIDTH)
+    return Grip(objects & touched, objects & pinched, empty=hand.width <= EMPTY_WIDTH)
 
 
 def _hanging(world: World, hand: Hand) -> dict[int, Pose]:
@@ -296,13 +307,14 @@ def _finish(
     world: World,
     hand: Hand,
     kind: OutcomeKind,
-    grasped: frozenset[int],
-    *,
-    contact_at_start: bool,
-    contact_on_way: bool,
+    at_start: HandContact | None,
+    on_way: HandContact | None,
+    closed: Grip | None = None,
+    grasped: frozenset[int] = frozenset(),
 ) -> Outcome:
     for body in sorted(grasped):
         world.remove(body)
     hand.park()
     lost = settle(world)
-    return Outcome(kind, tuple(sorted(grasped)), contact_at_start, contact_on_way, lost)
+    touching = (at_start is not None, on_way is not None)
+    return Outcome(kind, tuple(sorted(grasped)), *touching, lost, at_start or on_way, closed)

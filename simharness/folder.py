@@ -25,6 +25,7 @@ ROUNDS_FILE = "rounds.jsonl"
 ATTEMPTS_FILE = "attempts.jsonl"
 REPORT_FILE = "report.json"
 PAGE_FILE = "report.html"
+FAILURES_FILE = "failures.json"
 SERVICE_LOG = "service.log"
 PICTURES = "pictures"
 
@@ -161,7 +162,8 @@ class RunFolder:
         while (target := self.path / f"earlier-{number}").exists():
             number += 1
         target.mkdir()
-        for name in (RUN_FILE, ROUNDS_FILE, ATTEMPTS_FILE, REPORT_FILE, PAGE_FILE, SERVICE_LOG, PICTURES):
+        files = (RUN_FILE, ROUNDS_FILE, ATTEMPTS_FILE, REPORT_FILE, PAGE_FILE, FAILURES_FILE, SERVICE_LOG, PICTURES)
+        for name in files:
             if self._file(name).exists():
                 self._file(name).rename(target / name)
         self.pictures.mkdir()

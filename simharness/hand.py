@@ -9,6 +9,7 @@ import tempfile
 from collections.abc import Sequence
 from dataclasses import dataclass
 from pathlib import Path
+from typing import Literal
 
 import numpy as np
 from jaxtyping import Float64
@@ -29,6 +30,8 @@ GEAR_FORCE = 30.0
 CARRY_FORCE = 300.0
 PAD_FRICTION = 0.75
 PAD_SPINNING_FRICTION = 0.05
+
+HandPart = Literal["palm", "left finger", "right finger"]
 
 PARKED = Pose(np.eye(3), np.array([0.15, 0.15, 10.0]))
 """Where the hand waits: far from everything and behind every camera."""
@@ -116,6 +119,23 @@ def placements(Ts_world_grasp: Float64[np.ndarray, "grasps 4 4"], widths: Sequen
     ]
 
 
+@dataclass(frozen=True, slots=True)
+class HandContact:
+    """Where the hand touches something.
+
+    Args:
+        part: of the hand.
+        body: id of what it touches.
+        position: on that body's surface, metres in the world.
+        depth: metres by which the surfaces overlap.
+    """
+
+    part: HandPart
+    body: int
+    position: tuple[float, float, float]
+    depth: float
+
+
 class Hand:
     """A resident Panda hand in a world; parked far away between uses."""
 
@@ -185,6 +205,16 @@ class Hand:
     def touches_anything(self) -> bool:
         """Whether any part of the hand touches any other body, by the contacts found last."""
         return any(contact.other != self.body for contact in self._world.contacts(self.body))
+
+    def deepest_contact(self) -> HandContact | None:
+        """Where the hand overlaps another body most, by the contacts found last; None when it touches nothing."""
+        contacts = [contact for contact in self._world.contacts(self.body) if contact.other != self.body]
+        if not contacts:
+            return None
+        deepest = min(contacts, key=lambda contact: contact.distance)
+        left, right = self.fingers
+        parts: dict[int, HandPart] = {BASE_LINK: "palm", left: "left finger", right: "right finger"}
+        return HandContact(parts[deepest.link], deepest.other, deepest.position, -deepest.distance)
 
     def touched(self, *, within: float) -> tuple[set[int], set[int]]:
         """Bodies touched by any part of the hand, and bodies touched by both fingers, by the contacts found last.

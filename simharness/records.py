@@ -45,6 +45,9 @@ class RunSettings:
         executor: how a grasp is carried out and judged.
         model: network that the service is asked for.
         max_grasps: grasps requested for each observation; the first is executed.
+        dex_noise: whether depth has the noise of Dex-Net 2.0; None is the preset's own.
+        polar_deg: angle of every view from straight above; None is the preset's own.
+        voxel_size: edge of the voxels that keep one point each, metres; None keeps every point.
     """
 
     rounds: int
@@ -59,6 +62,9 @@ class RunSettings:
     executor: Executor
     model: str
     max_grasps: int
+    dex_noise: bool | None = None
+    polar_deg: float | None = None
+    voxel_size: float | None = None
 
     def to_json(self) -> dict[str, Any]:
         """The settings as JSON values."""
@@ -66,10 +72,10 @@ class RunSettings:
 
     @classmethod
     def from_json(cls, values: Mapping[str, Any]) -> RunSettings:
-        """Settings from `to_json`.
+        """Settings from `to_json`; runs recorded before an option existed were played without it.
 
         Raises:
-            TypeError: a field is missing or unknown.
+            TypeError: a field without a default is missing, or one is unknown.
         """
         return cls(**{**values, "seeds": tuple(values["seeds"])})
 

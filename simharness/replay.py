@@ -1,4 +1,4 @@
-"""A recorded attempt, simulated again from the round's seed with the grasps that were recorded."""
+"""Recorded attempts, simulated again from the round's seed with the grasps that were recorded."""
 
 from __future__ import annotations
 
@@ -35,10 +35,6 @@ class RecordedPlanner:
 class _Reached(Exception):
     """The attempt that was asked for has been carried out."""
 
-    def __init__(self, event: Attempted) -> None:
-        super().__init__()
-        self.event = event
-
 
 def find_attempt(rounds: Sequence[RoundRecord], index: int) -> AttemptRecord:
     """The attempt at a line of attempts.jsonl, the first being 0.
@@ -52,8 +48,8 @@ def find_attempt(rounds: Sequence[RoundRecord], index: int) -> AttemptRecord:
     return attempts[index]
 
 
-def replay(settings: RunSettings, objects: Sequence[ObjectModel], played: RoundRecord, attempt: int) -> Attempted:
-    """Play a recorded round up to one of its attempts.
+def replay(settings: RunSettings, objects: Sequence[ObjectModel], played: RoundRecord, attempt: int) -> list[Attempted]:
+    """Play a recorded round up to one of its attempts; all attempts until then, that one being the last.
 
     Args:
         settings: of the run.
@@ -64,6 +60,7 @@ def replay(settings: RunSettings, objects: Sequence[ObjectModel], played: RoundR
     Raises:
         UsageError: an attempt on the way ended otherwise than recorded; the objects or the simulator are others.
     """
+    events: list[Attempted] = []
 
     def listen(event: Attempted | Observed) -> None:
         if not isinstance(event, Attempted):
@@ -75,13 +72,14 @@ def replay(settings: RunSettings, objects: Sequence[ObjectModel], played: RoundR
                 f"{', '.join(now.objects)}; recorded was {recorded.outcome} with {', '.join(recorded.objects)}. "
                 "Replay with the object files and package versions of the run"
             )
+        events.append(event)
         if now.attempt == attempt:
-            raise _Reached(event)
+            raise _Reached
 
     try:
         play_round(settings, objects, RecordedPlanner(played), played.seed, played.round, listen, segmentation=True)
-    except _Reached as reached:
-        return reached.event
+    except _Reached:
+        return events
     raise UsageError(
         f"round {played.round} ended before attempt {attempt}; "
         "replay with the object files and package versions of the run"

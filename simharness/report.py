@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import platform
+from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
 from typing import Any
@@ -26,9 +27,9 @@ def report(run: Run, versions: dict[str, str]) -> dict[str, Any]:
     return {
         "complete": run.complete,
         "stopped_by": run.stopped_by,
-        **_numbers(summarise(run.rounds)),
+        **numbers(summarise(run.rounds)),
         "by_seed": {
-            str(seed): _numbers(summarise(record for record in run.rounds if record.seed == seed))
+            str(seed): numbers(summarise(record for record in run.rounds if record.seed == seed))
             for seed in run.settings.seeds
         },
         "settings": {
@@ -63,10 +64,10 @@ def table(run: Run) -> str:
     if len(run.settings.seeds) > 1:
         for seed in run.settings.seeds:
             rows += _rate_rows(summarise(record for record in run.rounds if record.seed == seed), f" seed {seed}")
-    widths = [max(len(row[column]) for row in rows) for column in range(4)]
-    lines = [title(run), ""]
-    lines += ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
-    lines += [
+    lines = [
+        title(run),
+        "",
+        *aligned(rows),
         "",
         f"rounds    {total.rounds} of {run.settings.rounds * len(run.settings.seeds)}: {counts(total.ended)}",
         f"failures  {counts(total.failures)}",
@@ -76,6 +77,12 @@ def table(run: Run) -> str:
     if run.stopped_by is not None:
         lines.append(f"INCOMPLETE: {run.stopped_by.splitlines()[0]}")
     return "\n".join(lines)
+
+
+def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
+    """Rows of equally many cells as lines with their columns one below the other."""
+    widths = [max(map(len, column)) for column in zip(*rows, strict=True)]
+    return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
 def title(run: Run) -> str:
@@ -121,7 +128,8 @@ def _rate_rows(summary: Summary, suffix: str) -> list[tuple[str, str, str, str]]
     return rows
 
 
-def _numbers(summary: Summary) -> dict[str, Any]:
+def numbers(summary: Summary) -> dict[str, Any]:
+    """A summary as JSON values: rates are fractions, None where there was nothing to count; times in milliseconds."""
     return {
         "gsr": summary.gsr.value,
         "gsr_interval": list(summary.gsr.interval),

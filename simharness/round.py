@@ -14,7 +14,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from simharness.camera import PRESET_NOISE, Noise, Observation, observe
-from simharness.execute import attempt
+from simharness.execute import Outcome, attempt
 from simharness.hand import Hand
 from simharness.objects import ObjectModel
 from simharness.records import (
@@ -120,10 +120,12 @@ class Attempted:
     Args:
         record: how it went.
         before: the observation that it came from.
+        outcome: what the executor says of it.
     """
 
     record: AttemptRecord
     before: Observed
+    outcome: Outcome
 
 
 Listener = Callable[["Observed | Attempted"], None]
@@ -152,6 +154,8 @@ def camera_noise(settings: RunSettings) -> Noise:
         noise = replace(noise, point_sigma=settings.noise_std)
     if settings.depth_noise_std is not None:
         noise = replace(noise, depth_sigma=settings.depth_noise_std)
+    if settings.dex_noise is not None:
+        noise = replace(noise, dex=settings.dex_noise)
     return noise
 
 
@@ -235,7 +239,15 @@ class _Table:
 
     def _observe(self, planner: GraspPlanner, observation: int) -> Observed:
         rng = camera_rng(self._seed, self._round, observation)
-        view = observe(self._world, self._settings.camera, rng, self._noise, segmentation=self._segmentation)
+        view = observe(
+            self._world,
+            self._settings.camera,
+            rng,
+            self._noise,
+            polar_deg=self._settings.polar_deg,
+            voxel_size=self._settings.voxel_size,
+            segmentation=self._segmentation,
+        )
         plan = planner.plan(view, request_seed(self._seed, self._round, observation))
         present = {body: self._names[body] for body in self._world.objects}
         observed = Observed(self._seed, self._round, observation, view, plan, present)
@@ -266,5 +278,5 @@ class _Table:
             latency=plan.latency,
         )
         self.attempts.append(record)
-        self._tell(Attempted(record, observed))
+        self._tell(Attempted(record, observed, outcome))
         return record

@@ -50,12 +50,14 @@ class Contact:
         other: the other body.
         other_link: that body's link.
         distance: metres between the surfaces, negative when they overlap.
+        position: on the other body's surface, metres in the world.
     """
 
     link: int
     other: int
     other_link: int
     distance: float
+    position: tuple[float, float, float]
 
 
 @final
@@ -289,7 +291,7 @@ class World:
         """
         points: Any = bullet.getContactPoints(body, physicsClientId=self._client)
         return [
-            Contact(link=point[3], other=point[2], other_link=point[4], distance=point[8])
+            Contact(link=point[3], other=point[2], other_link=point[4], distance=point[8], position=point[6])
             for point in points
             if point[8] <= within
         ]

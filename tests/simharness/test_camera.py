@@ -18,6 +18,7 @@ from simharness.camera import (
     observe,
     render,
     sample_camera,
+    thin,
 )
 from simharness.scene import PERCEPTION_BOX, TABLE_HEIGHT, restore_scene
 from simharness.world import World
@@ -110,6 +111,26 @@ def test_every_preset_looks_at_the_workspace_from_where_the_protocol_says(preset
         assert camera.translation[2] > 0.3
     heights = {round(camera.translation[2], 9) for camera in cameras}
     assert len(heights) == 1
+
+
+def test_another_polar_angle_leaves_the_rest_of_the_view_as_it_was() -> None:
+    def view(polar_deg: float | None) -> tuple[float, float, float]:
+        (camera,) = sample_camera("random", np.random.default_rng(3), polar_deg)
+        away = camera.translation - [0.15, 0.15, 0.25]
+        radius = float(np.linalg.norm(away))
+        return radius, float(np.arctan2(away[1], away[0])), float(np.rad2deg(np.arccos(away[2] / radius)))
+
+    own, steep = view(None), view(15.0)
+    assert own[:2] == pytest.approx(steep[:2])
+    assert steep[2] == pytest.approx(15.0)
+    assert 45 <= own[2] <= 60
+
+
+def test_a_thinned_cloud_keeps_the_mean_of_each_voxel() -> None:
+    points = np.array([[0.001, 0.001, 0.001], [0.003, 0.001, 0.001], [-0.001, 0.001, 0.001], [0.011, 0.0, 0.0]])
+    expected = [[-0.001, 0.001, 0.001], [0.002, 0.001, 0.001], [0.011, 0.0, 0.0]]
+    np.testing.assert_allclose(thin(points, 0.01), expected, atol=1e-12)
+    assert thin(np.empty((0, 3)), 0.01).shape == (0, 3)
 
 
 def test_fused_views_show_every_side_of_the_box(world: World) -> None:
