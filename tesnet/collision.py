@@ -10,33 +10,41 @@ from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
+from tesnet.query import Box
 from tesnet.visibility import depth_behind
 
 SHADOW_MARGIN = 0.01
 """A place is hidden when it lies this far behind the surface that covers it."""
 
+BORDER = 0.005
+"""Points this near to a side of the workspace are taken to be cut off by it: as far as prepared points are apart."""
+
+REACH_BEYOND = 0.04
+"""How far beyond the workspace things are taken to go on."""
+
+_LEVEL = 0.5
 _BLOCK = 4_000_000
 _COARSE_STRIDE = 6
 
 
 def in_collision(
-    cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float, approach_distance: float
+    points: Tensor, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float, approach_distance: float
 ) -> Tensor:
-    """Mask (C,): an observed point lies in the hand anywhere on its way to the grasp.
+    """Mask (C,): a point lies in the hand anywhere on its way to the grasp.
 
     Args:
-        cloud: P observed points.
+        points: (P, 3) that the hand shall not meet.
         Ts_canonical_grasp: (C, 4, 4) TCP poses.
         gripper: the hand.
         width: opening of the fingers.
         approach_distance: length of the straight approach, which ends in the grasp.
     """
-    hit = torch.zeros(len(Ts_canonical_grasp), dtype=torch.bool, device=cloud.points.device)
+    hit = torch.zeros(len(Ts_canonical_grasp), dtype=torch.bool, device=points.device)
     # Most collisions show with a few points already; the others are looked for with all of them.
-    for points in (cloud.points[::_COARSE_STRIDE], cloud.points):
+    for some in (points[::_COARSE_STRIDE], points):
         open_rows = (~hit).nonzero()[:, 0]
-        for rows in open_rows.split(max(1, _BLOCK // max(1, len(points)))):
-            hit[rows] = _hit(points, Ts_canonical_grasp[rows], gripper, width, approach_distance)
+        for rows in open_rows.split(max(1, _BLOCK // max(1, len(some)))):
+            hit[rows] = _hit(some, Ts_canonical_grasp[rows], gripper, width, approach_distance)
     return hit
 
 
@@ -74,6 +82,34 @@ def points_in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tenso
     shifts = (origins[:, None, :] @ rotations)[:, 0]
     x, y, z = (torch.addmm(-shifts[:, axis : axis + 1], rotations[:, :, axis], points.T) for axis in range(3))
     return x, y, z
+
+
+def beyond(cloud: PreparedCloud, workspace: Box) -> Tensor:
+    """Places (B, 3) where things that a side of the workspace cuts off are taken to go on, straight out of it.
+
+    The support, and whatever else lies across `up`, is no such side; without `up` there is none.
+
+    Args:
+        cloud: P observed points.
+        workspace: in the frame of the query.
+    """
+    if cloud.up is None:
+        return cloud.points[:0]
+    points = torch.from_numpy(cloud.T_cloud_canonical.apply(cloud.points.cpu().numpy()))
+    up = cloud.T_cloud_canonical.rotate(cloud.up.cpu().numpy())
+    steps = torch.arange(BORDER, REACH_BEYOND, BORDER, dtype=torch.float64)
+    found = []
+    for axis in range(3):
+        if abs(up[axis]) > _LEVEL:
+            continue
+        for end, sign in ((workspace.minimum[axis], -1.0), (workspace.maximum[axis], 1.0)):
+            cut = points[(points[:, axis] - end).abs() < BORDER]
+            shift = torch.zeros(len(steps), 3, dtype=torch.float64)
+            shift[:, axis] = sign * steps
+            found.append((cut[:, None] + shift).reshape(-1, 3))
+    places = torch.cat(found) if found else points[:0]
+    canonical = cloud.T_cloud_canonical.inverse().apply(places.numpy())
+    return torch.from_numpy(canonical).to(cloud.points)
 
 
 def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float) -> Tensor:

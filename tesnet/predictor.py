@@ -13,10 +13,10 @@ import torch
 
 from tesnet import candidates, cloud, collision, networks, ranking, support, weights
 from tesnet.errors import DeviceError, WeightsError
-from tesnet.geometry import PANDA, GraspSet
+from tesnet.geometry import PANDA, GraspSet, Gripper
 from tesnet.networks import Network
 from tesnet.networks.tesnet import CloudFeatures
-from tesnet.query import GraspQuery
+from tesnet.query import Box, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 
 COARSEST_RESOLUTION = 0.0005
@@ -194,10 +194,20 @@ class GraspPredictor:
 
     def _blocked(self, prepared: cloud.PreparedCloud, found: candidates.Candidates, query: GraspQuery) -> torch.Tensor:
         poses, hand = found.Ts_canonical_grasp, query.gripper
-        blocked = collision.in_collision(prepared, poses, hand, hand.max_width, APPROACH_DISTANCE)
+        blocked = collision.in_collision(prepared.points, poses, hand, hand.max_width, APPROACH_DISTANCE)
+        if query.workspace is not None:
+            unsafe = self._meets_what_is_cut_off(prepared, query.workspace, poses, hand)
+            if not bool((blocked | unsafe).all()):  # a guess must not leave nothing
+                blocked |= unsafe
         if query.unseen == "occupied":
             blocked |= collision.in_shadow(prepared, poses, hand, hand.max_width)
         return blocked
+
+    def _meets_what_is_cut_off(
+        self, prepared: cloud.PreparedCloud, workspace: Box, poses: torch.Tensor, hand: Gripper
+    ) -> torch.Tensor:
+        places = collision.beyond(prepared, workspace)
+        return collision.in_collision(places, poses, hand, hand.max_width, APPROACH_DISTANCE)
 
     def _synchronise(self) -> None:
         if self.device.type == "cuda":  # or a stage's work would be counted in a later one

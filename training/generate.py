@@ -265,7 +265,7 @@ def _label_view(
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
-    free = ~in_collision(prepared, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
+    free = ~in_collision(prepared.points, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
     chosen = _choose(prepared, found, free, config, rng, network)
     if len(chosen) == 0:
         return None

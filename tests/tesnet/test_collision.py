@@ -44,7 +44,7 @@ def assert_agree(found: Array, depth: Array) -> None:
 
 
 def hits(points: Array, Ts: Array, width: float, sweep: float = SWEEP) -> Array:
-    found = collision.in_collision(bare_cloud(points), torch.from_numpy(Ts).float(), PANDA, width, sweep)
+    found = collision.in_collision(bare_cloud(points).points, torch.from_numpy(Ts).float(), PANDA, width, sweep)
     return np.asarray(found.numpy())
 
 
@@ -69,7 +69,7 @@ def test_collision_is_that_of_a_brute_force_twin(seed: int, count: int, width: f
 def test_the_candidates_of_a_scene_collide_as_the_twin_says() -> None:
     ready = prepared(tabletop_query())
     found, _ = candidates.generate(ready, tabletop_query(max_candidates=150), candidates.CandidateConfig())
-    hit = collision.in_collision(ready, found.Ts_canonical_grasp, PANDA, 0.08, SWEEP).numpy()
+    hit = collision.in_collision(ready.points, found.Ts_canonical_grasp, PANDA, 0.08, SWEEP).numpy()
     assert_agree(hit, penetration(ready.points.double().numpy(), found.Ts_canonical_grasp.double().numpy(), 0.08))
     assert 0.1 < hit.mean() < 0.99
 

@@ -122,7 +122,7 @@ def test_thinner_fingers_collide_less() -> None:
     ready = prepared(query)
     poses = candidates.generate(ready, query, candidates.CandidateConfig())[0].Ts_canonical_grasp
     thin = Gripper.like_panda({"finger_thickness": 0.006, "finger_breadth": 0.01})
-    slim, panda = (collision.in_collision(ready, poses, hand, 0.08, 0.05) for hand in (thin, PANDA))
+    slim, panda = (collision.in_collision(ready.points, poses, hand, 0.08, 0.05) for hand in (thin, PANDA))
     assert not bool((slim & ~panda).any())
     assert int(slim.sum()) < int(panda.sum())
 
