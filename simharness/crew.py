@@ -9,6 +9,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import socket
 from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
@@ -24,6 +25,7 @@ if TYPE_CHECKING:
     from ray.actor import ActorHandle
 
 _STOPS_WITHIN_S = 5.0
+_ANSWERS_WITHIN_S = 5.0
 _RESTARTS = 3
 """How often Ray replaces a worker that died, with the job it was at."""
 
@@ -277,6 +279,7 @@ def _actors(task: Task[Job], count: int, address: str) -> Iterator[_Actors[Job]]
     except ModuleNotFoundError:
         raise UsageError("--ray needs Ray: pip install 'tes-net[ray]'") from None
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    _check_listens(address)
     on_sigterm = signal.getsignal(signal.SIGTERM)
     try:
         ray.init(address=address, log_to_driver=False, runtime_env={"env_vars": _settings_of_the_service(os.environ)})
@@ -293,6 +296,20 @@ def _actors(task: Task[Job], count: int, address: str) -> Iterator[_Actors[Job]]
             ray.wait(ended, num_returns=count, timeout=_STOPS_WITHIN_S)
     finally:
         ray.shutdown()  # which ends the actors
+
+
+def _check_listens(address: str) -> None:
+    """Whether anything listens at HOST:PORT, which Ray itself would try for minutes; other addresses are Ray's to judge.
+
+    Raises:
+        UsageError: nothing does.
+    """
+    host, _, port = address.rpartition(":")
+    if host and port.isdecimal():
+        try:
+            socket.create_connection((host, int(port)), timeout=_ANSWERS_WITHIN_S).close()
+        except (OSError, OverflowError) as error:
+            raise UsageError(f"--ray {address}: no cluster answers ({error}); start one with `ray start`") from error
 
 
 def _settings_of_the_service(environment: Mapping[str, str]) -> dict[str, str]:

@@ -80,6 +80,7 @@ def test_a_job_or_worker_that_fails_breaks_the_run_and_says_how(task: Squares, j
             hear(workers, 1)
 
 
-def test_an_address_that_is_no_clusters_is_named() -> None:
-    with pytest.raises(UsageError, match="--ray nowhere: "), crew(Squares(), 1, "nowhere"):
+@pytest.mark.parametrize("address", ["nowhere", "127.0.0.1:9", "127.0.0.1:99999"])
+def test_an_address_that_is_no_clusters_is_named(address: str) -> None:
+    with pytest.raises(UsageError, match=f"--ray {address}: "), crew(Squares(), 1, address):
         pass
