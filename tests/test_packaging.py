@@ -31,7 +31,7 @@ EXTRAS = {
     "service": ("service",),
     "simharness": ("sim",),
     "training": ("service", "sim"),
-    "bench": ("service",),
+    "bench": ("service", "dev"),  # fuzzing needs what generates requests
 }
 
 

@@ -100,7 +100,7 @@ def moved_query(query: GraspQuery, motion: Pose) -> GraspQuery:
         options["viewpoints"] = motion.apply(query.viewpoints)
     if query.up is not None:
         options["up"] = motion.rotate(query.up)
-        if query.support_height is not None:
+        if isinstance(query.support_height, float):
             options["support_height"] = query.support_height + float(motion.translation @ options["up"])
     names = ("max_grasps", "min_score", "separation_translation", "separation_rotation_deg", "num_approach_points")
     options |= {name: getattr(query, name) for name in (*names, "max_candidates", "unseen", "seed")}
