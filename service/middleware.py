@@ -87,8 +87,7 @@ class RequestMiddleware:
         try:
             await self._app(scope, receiving, sending)
         except asyncio.CancelledError:  # the server's: draining took too long
-            if not record.status:
-                await _refuse_at_the_end(record, scope, receive, send)
+            await _refuse_at_the_end(record, scope, receive, send)
         except Exception as error:
             log.exception("failed", extra={"fields": {"request_id": record.request_id}})
             if record.status:
@@ -130,7 +129,9 @@ def _announces_body(headers: Headers) -> bool:
 
 
 async def _refuse_at_the_end(record: RequestRecord, scope: Scope, receive: Receive, send: Send) -> None:
-    """Answer 503, without waiting for the rest of a body."""
+    """Answer 503, without waiting for the rest of a body, unless an answer was begun."""
+    if record.status:
+        return
     error = NotReady("The service ended before this request was answered; repeat it.", retry_after=1)
     response = problem_response(error, scope)
     response.headers.update({"X-Request-ID": record.request_id, "Connection": "close"})
