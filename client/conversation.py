@@ -73,7 +73,7 @@ def ask(
     """Send a request, again where `policy` allows it, and return the parsed answer, all within `timeout` seconds.
 
     Raises:
-        ServiceUnreachable: the connection was refused or lost on every try.
+        ServiceUnreachable: the connection, or a proxy's to the service, was refused or lost on every try.
         ServiceTimeout: no answer in time.
         ProblemError: the service refused or failed; see `client.errors` for the kinds.
         UnexpectedResponse: the answer is not this service's.
@@ -95,7 +95,7 @@ def ask(
             if outcome.status == 200:
                 return parse(outcome)
             refusal = problem(outcome)
-            if not isinstance(refusal, Overloaded):
+            if not isinstance(refusal, Overloaded | ServiceUnreachable):
                 raise refusal
             error = refusal
         retry_after = error.retry_after if isinstance(error, Overloaded) else None

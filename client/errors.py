@@ -4,7 +4,7 @@
 
     GraspClientError
     +-- InvalidArgument          refused here, before anything is sent; also a ValueError; `argument` names it
-    +-- ServiceUnreachable       no connection, or lost on every try
+    +-- ServiceUnreachable       no connection, or lost on every try, by a proxy before the service too
     +-- ServiceTimeout           no answer within the caller's timeout
     +-- UnexpectedResponse       an answer, but not this service's: wrong URL, a proxy's page, another version
     +-- ProblemError             the service's own problem+json: status, title, detail, request_id, problem
@@ -50,7 +50,7 @@ class InvalidArgument(GraspClientError, ValueError):
 
 
 class ServiceUnreachable(GraspClientError):
-    """No connection to the service, or a connection lost on every try."""
+    """No connection to the service, or a connection lost on every try, be it ours or a proxy's."""
 
 
 class ServiceTimeout(GraspClientError):

@@ -15,12 +15,15 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 from pydantic import BaseModel, ValidationError
 
-from client.errors import ProblemError, UnexpectedResponse, problem_class
+from client.errors import ProblemError, ServiceUnreachable, UnexpectedResponse, problem_class
 from service import schemas
 from tesnet.geometry import Pose
 
 STATUSES_OF_PROXIES = frozenset({401, 413, 429, 503, 504})
 """Statuses that mean the same from a proxy as from the service."""
+
+STATUSES_OF_LOST_SERVICES = frozenset({500, 502})
+"""What proxies answer, in their own words, when the service behind them ended before its answer was there."""
 
 Document = TypeVar("Document", bound=BaseModel)
 Array = NDArray[np.float64]
@@ -256,17 +259,21 @@ def model_reply(answer: Answer) -> ModelReply:
     )
 
 
-def problem(answer: Answer) -> ProblemError | UnexpectedResponse:
+def problem(answer: Answer) -> ProblemError | ServiceUnreachable | UnexpectedResponse:
     """The error that an answer other than 200 stands for.
 
     A proxy before the service answers in its own words; where its status is one that the service uses, it is the same
-    kind of problem. Any other answer that is no problem document is an `UnexpectedResponse`.
+    kind of problem, and one that lost the service on its way leaves it unreachable. Any other answer that is no problem
+    document is an `UnexpectedResponse`.
     """
     retry_after = _seconds(answer.headers.get("retry-after"))
     request_id = answer.headers.get("x-request-id")
     try:
         document = schemas.Problem.model_validate_json(answer.body)
     except ValidationError:
+        if answer.status in STATUSES_OF_LOST_SERVICES:
+            why = "without a problem document, as proxies answer when they have lost the service behind them"
+            return ServiceUnreachable(f"status {answer.status} {why}")
         if answer.status not in STATUSES_OF_PROXIES:
             return _unexpected(answer, "it is no problem document")
         title = HTTPStatus(answer.status).phrase

@@ -15,8 +15,8 @@ from client.errors import InvalidArgument
 class RetryPolicy:
     """How often and how patiently to try again.
 
-    Lost connections, and the answers 429 and 503, are tried again. Other answers never are: they would be the same
-    again. A timeout never is: the time is used up.
+    Lost connections are tried again, a proxy's to the service too (its 500 or 502), and so are the answers 429 and 503.
+    Other answers never are: they would be the same again. A timeout never is: the time is used up.
 
     Args:
         max_retries: tries after the first.

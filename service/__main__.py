@@ -25,7 +25,6 @@ from service.protocol import PunctualProtocol
 from service.settings import InvalidSetting, Settings, load_settings, service_version, unknown_variables, variables
 
 if TYPE_CHECKING:
-    from service.batching import Predictor, PredictorFactory
     from service.grasps import GraspEndpoint
 
 log = logging.getLogger("service")
@@ -60,6 +59,7 @@ def main() -> int:
 
 def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
     from service.app import create_app  # noqa: PLC0415 - after the port is known to be free
+    from service.loading import predictor_factory  # noqa: PLC0415 - the same
 
     host, port = listener.getsockname()[:2]
     url = f"http://{f'[{host}]' if ':' in host else host}:{port}"
@@ -82,9 +82,10 @@ def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
         failures.append(error)
         server.should_exit = True
 
-    app = create_app(settings, _predictor_factory(settings), on_ready, on_failure)
+    app = create_app(settings, predictor_factory(settings), on_ready, on_failure)
     config = uvicorn.Config(
         app,
+        loop="asyncio",  # named, because uvicorn would take another where it happens to be installed
         http=PunctualProtocol,
         log_config=None,
         access_log=False,
@@ -111,17 +112,6 @@ def _allow_many_connections() -> None:
     wanted = MAX_OPEN_FILES if hard == resource.RLIM_INFINITY else min(hard, MAX_OPEN_FILES)
     if soft != resource.RLIM_INFINITY and soft < wanted:
         resource.setrlimit(resource.RLIMIT_NOFILE, (wanted, hard))
-
-
-def _predictor_factory(settings: Settings) -> PredictorFactory:
-    def make() -> Predictor:
-        from tesnet.predictor import GraspPredictor  # noqa: PLC0415 - loads torch, while the port answers already
-        from tesnet.weights import default_weights  # noqa: PLC0415 - the same
-
-        weights = settings.weights or default_weights(settings.models)
-        return GraspPredictor.load(weights, device=settings.device, num_threads=settings.num_threads)
-
-    return make
 
 
 class _Server(uvicorn.Server):

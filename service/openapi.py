@@ -110,8 +110,8 @@ def _grasps(options: dict[str, Any]) -> dict[str, Any]:
                             "type": "string",
                             "format": "binary",
                             "description": "A .npz, for `Accept: application/x-npz`: arrays scores (M), poses "
-                            "(M, 4, 4) in `frame_convention`, hand_poses and pregrasps (M, 4, 4), widths (M), "
-                            "approach_points and contact_points (M, 3); and meta, the rest of the document as text.",
+                            "(M, 4, 4) in `frame_convention`, hand_poses and pregrasps (M, 4, 4), widths "
+                            "(M), approach_points and contact_points (M, 3); and meta, the rest of the JSON as text.",
                         }
                     },
                 },

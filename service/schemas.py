@@ -11,7 +11,6 @@ from collections.abc import Sequence
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
-from pydantic_core import PydanticCustomError
 
 from tesnet.geometry import PANDA, FrameConvention
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS
@@ -63,7 +62,7 @@ class Target(RequestPart):
     @model_validator(mode="after")
     def _one_of_two(self) -> Target:
         if (self.box is None) == (self.indices is None):
-            raise PydanticCustomError("target", "give either `box` or `indices`")
+            raise ValueError("give either `box` or `indices`")
         return self
 
 

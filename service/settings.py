@@ -11,7 +11,7 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
 
 PREFIX = "GRASP_"
 MAX_THREADS = 8
@@ -139,6 +139,39 @@ class Settings(BaseModel):
     def max_body_bytes(self) -> int:
         """Bytes in a request's body."""
         return int(self.max_body_mb * 2**20)
+
+
+class Replicas(BaseModel):
+    """How many of the service Ray Serve runs, and each one's share of a machine."""
+
+    model_config = ConfigDict(extra="forbid", frozen=True)
+
+    min_replicas: int = Field(default=1, ge=1, le=1000, description="Replicas that are always there, 1 to 1000.")
+    max_replicas: int = Field(
+        default=1, ge=1, le=1000, description="Replicas under load, from --min-replicas (the default) to 1000."
+    )
+    target_ongoing_requests: float = Field(
+        default=2.0, gt=0, le=1000, description="Requests a replica should have; more of them add replicas."
+    )
+    cpus: float = Field(default=1.0, gt=0, le=1024, description="CPU cores of a replica, more than 0.")
+    gpus: float = Field(
+        default=0.0, ge=0, le=64, description="GPUs of a replica: 0, a share such as 0.25, or a whole number."
+    )
+
+    @field_validator("gpus")
+    @classmethod
+    def _share_or_whole(cls, gpus: float) -> float:
+        if gpus > 1 and gpus != int(gpus):
+            raise ValueError("a share of a GPU is less than 1")
+        return gpus
+
+    @model_validator(mode="after")
+    def _fits(self) -> Replicas:
+        if self.max_replicas < self.min_replicas:
+            raise ValueError(
+                f"is {self.max_replicas}, less than --min-replicas, {self.min_replicas}; give at least that"
+            )
+        return self
 
 
 def load_settings(environment: Mapping[str, str]) -> Settings:

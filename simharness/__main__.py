@@ -26,7 +26,7 @@ from simharness.folder import PAGE_FILE, REPORT_FILE, RunFolder
 from simharness.metrics import summarise
 from simharness.objects import SceneKind, load_object_set
 from simharness.page import page
-from simharness.photographer import Photographer, attempts_to_show
+from simharness.photographer import attempts_to_show, keep_only, take_pictures
 from simharness.records import RoundRecord, RunSettings
 from simharness.replay import find_attempt, replay
 from simharness.report import package_versions, percent, report, table
@@ -88,6 +88,7 @@ def _run(options: argparse.Namespace) -> int:
             folder,
             workers=1 if options.watch else options.workers,
             url=options.url,
+            ray=options.ray,
             resume=options.resume,
             hooks=Hooks(progress.start, progress.add, event),
         )
@@ -106,7 +107,7 @@ def _leave(result: Run, folder: RunFolder) -> None:
     """Write the reports."""
     shown = attempts_to_show(result.rounds, result.settings.seeds[0])
     if result.complete:
-        Photographer(result.settings, folder.pictures).keep_only(shown)
+        keep_only(folder.pictures, shown)
     content = report(result, package_versions())
     folder.write_json(REPORT_FILE, content)
     folder.write_text(PAGE_FILE, page(result, content, shown, folder.pictures))
@@ -122,11 +123,12 @@ def _replay(options: argparse.Namespace) -> int:
     event = replay(settings, objects, played, recorded.attempt)
     target = folder.path / f"replay-{options.attempt}"
     target.mkdir(exist_ok=True)
-    pictures = Photographer(settings, target).take(event)
     print(f"attempt {options.attempt}: seed {recorded.seed}, round {recorded.round}, its attempt {recorded.attempt}")
     lifted = f" ({', '.join(event.record.grasped)})" if event.record.grasped else ""
     print(f"outcome {event.record.outcome}{lifted}, score {recorded.score:.3f}; recorded {recorded.outcome}")
-    for path in pictures:
+    for picture in take_pictures(event):
+        path = target / picture.name
+        path.write_bytes(picture.content)
         print(path)
     return 0
 
@@ -189,6 +191,11 @@ def _run_parser() -> argparse.ArgumentParser:
     )
     add("--model", default="tesnet", metavar="NAME", help="network to ask for (default %(default)s)")
     add("--url", help="a running service (default: one is started for the run)")
+    add(
+        "--ray",
+        metavar="ADDRESS",
+        help="play the rounds on this Ray cluster; without --url every worker there has a service of its own",
+    )
     add("--out", type=Path, metavar="DIR", help="where the reports go (default: a new folder in runs/)")
     add("--resume", action="store_true", help="continue the run in --out")
     add("--watch", action="store_true", help="show the run live in a browser page; plays with one worker")
@@ -221,6 +228,8 @@ def _settings(options: argparse.Namespace) -> RunSettings:
     seeds = tuple(options.seeds or [options.seed or 0])
     if len(set(seeds)) < len(seeds):
         raise UsageError(f"--seeds {' '.join(map(str, seeds))}: a seed is named twice; name each once")
+    if options.watch and options.ray is not None:
+        raise UsageError("--watch shows a worker of this machine; leave out --ray, or --watch")
     if options.resume and options.out is None:
         raise UsageError("--resume needs --out: the folder of the run to continue")
     return RunSettings(

@@ -129,6 +129,10 @@ class RunFolder:
         _append(self._file(ATTEMPTS_FILE), (attempt.to_json() for attempt in record.attempts))
         _append(self._file(ROUNDS_FILE), [record.to_json()])
 
+    def add_picture(self, name: str, content: bytes) -> None:
+        """Add a picture of an attempt."""
+        (self.pictures / name).write_bytes(content)
+
     def rewrite(self, rounds: Iterable[RoundRecord]) -> None:
         """Replace both files by `rounds` in the order of seed, round and attempt."""
         ordered = sorted(rounds, key=lambda record: (record.seed, record.round))

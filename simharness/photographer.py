@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 from collections.abc import Iterable
+from dataclasses import dataclass
 from pathlib import Path
 
 import numpy as np
@@ -35,6 +36,14 @@ _ROUNDS_WITH_FAILURES = 24
 """Failures are looked for in so many rounds; later rounds take no pictures."""
 
 
+@dataclass(frozen=True, slots=True)
+class Picture:
+    """A PNG and its file's name."""
+
+    name: str
+    content: bytes
+
+
 def picture_name(attempt: AttemptRecord, view: str) -> str:
     """File name of one of the VIEWS of an attempt."""
     return f"seed{attempt.seed}-round{attempt.round:04d}-attempt{attempt.attempt:02d}-{view}.png"
@@ -54,39 +63,33 @@ class Photographer:
 
     Args:
         settings: of the run; only its first seed is pictured.
-        pictures: the folder for them.
     """
 
-    def __init__(self, settings: RunSettings, pictures: Path) -> None:
+    def __init__(self, settings: RunSettings) -> None:
         self._seed = settings.seeds[0]
-        self._pictures = pictures
 
     def wants(self, seed: int, round_number: int) -> bool:
         """Whether anything of a round may be shown."""
         return seed == self._seed and round_number < max(FIRST_ROUNDS, _ROUNDS_WITH_FAILURES)
 
-    def __call__(self, event: Observed | Attempted) -> None:
-        """Store the pictures of an attempt that may be shown."""
+    def __call__(self, event: Observed | Attempted) -> list[Picture]:
+        """The pictures of an attempt that may be shown; none of anything else."""
         if not isinstance(event, Attempted) or event.record.seed != self._seed:
-            return
-        if _is_first(event.record) or _is_failure(event.record):
-            self.take(event)
+            return []
+        return take_pictures(event) if _is_first(event.record) or _is_failure(event.record) else []
 
-    def take(self, event: Attempted) -> list[Path]:
-        """Store the pictures of an attempt; where they are."""
-        paths = []
-        for view, content in attempt_pictures(event).items():
-            path = self._pictures / picture_name(event.record, view)
-            path.write_bytes(content)
-            paths.append(path)
-        return paths
 
-    def keep_only(self, shown: Iterable[AttemptRecord]) -> None:
-        """Remove the pictures of attempts that the report does not show."""
-        names = {picture_name(attempt, view) for attempt in shown for view in VIEWS}
-        for path in self._pictures.glob("seed*-*.png"):
-            if path.name not in names:
-                path.unlink()
+def take_pictures(event: Attempted) -> list[Picture]:
+    """The pictures of an attempt."""
+    return [Picture(picture_name(event.record, view), content) for view, content in attempt_pictures(event).items()]
+
+
+def keep_only(pictures: Path, shown: Iterable[AttemptRecord]) -> None:
+    """Remove the pictures in a folder that are of other attempts."""
+    names = {picture_name(attempt, view) for attempt in shown for view in VIEWS}
+    for path in pictures.glob("seed*-*.png"):
+        if path.name not in names:
+            path.unlink()
 
 
 def attempt_pictures(event: Attempted) -> dict[str, bytes]:

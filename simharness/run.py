@@ -1,4 +1,4 @@
-"""A whole run: worker processes play rounds, this process writes them down.
+"""A whole run: workers play rounds, this process writes them down.
 
 The service may be anywhere; with no address given, one is started for the run. Workers share nothing and each round is
 played in a world of its own, so their number changes no result.
@@ -6,27 +6,27 @@ played in a world of its own, so their number changes no result.
 
 from __future__ import annotations
 
-import multiprocessing
-import signal
-from collections import deque
 from collections.abc import Callable, Iterator, Sequence
 from contextlib import ExitStack, contextmanager
 from dataclasses import dataclass
-from multiprocessing.connection import Connection, wait
-from multiprocessing.process import BaseProcess
-from typing import Any, Literal
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
 
+from simharness.crew import Crew, Done, Emit, Event, Work, crew
 from simharness.errors import RunBroken, SimError
 from simharness.folder import SERVICE_LOG, RunFolder
 from simharness.objects import ObjectModel
-from simharness.photographer import Photographer
+from simharness.photographer import Photographer, Picture
 from simharness.planner import HttpPlanner
 from simharness.records import ModelRecord, RoundRecord, RunSettings, Serving
 from simharness.round import Attempted, Observed, play_round
 from simharness.server import NUM_THREADS, LocalService
 
 _LOOK_AFTER_SERVICE_S = 1.0
-_WORKER_STOPS_WITHIN_S = 5.0
+
+_RoundKey = tuple[int, int]
+"""A run seed and a round's number."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -75,6 +75,7 @@ def run(
     *,
     workers: int,
     url: str | None,
+    ray: str | None = None,
     resume: bool,
     hooks: Hooks,
 ) -> Run:
@@ -85,6 +86,7 @@ def run(
         objects: the object set.
         folder: where the rounds go.
         workers: processes that play rounds.
+        ray: address of a Ray cluster that they run on; None for this machine.
         url: the service; None starts one for the run.
         resume: whether to continue what the folder holds.
         hooks: who is told.
@@ -93,9 +95,9 @@ def run(
         UsageError: the folder, the address or the model's name cannot be used, or the recorded run was another.
     """
     done = {(record.seed, record.round): record for record in folder.prepare(settings, resume)}
-    todo = deque(
+    todo = [
         (seed, number) for seed in settings.seeds for number in range(settings.rounds) if (seed, number) not in done
-    )
+    ]
     model: ModelRecord | None = None
     serving: Serving | None = None
     stopped_by = None
@@ -113,12 +115,17 @@ def run(
                 serving = Serving(url, NUM_THREADS if service is not None else None, document.get("device"))
                 folder.start(settings, model, serving)
                 hooks.started(tuple(done.values()))
-                task = _Task(settings, objects, address, folder, hooks.event is not None)
-                for message in _play_in_workers(task, todo, min(workers, len(todo)), service):
+                # On a cluster nobody reaches this machine's service, so workers there have their own.
+                reached = address if ray is None else url
+                task = _Rounds(settings, objects, reached, model, hooks.event is not None)
+                rounds = stack.enter_context(crew(task, min(workers, len(todo)), ray))
+                for message in _play(rounds, todo, service):
                     if isinstance(message, RoundRecord):
                         folder.append(message)
                         done[message.seed, message.round] = message
                         hooks.round_done(message)
+                    elif isinstance(message, Picture):
+                        folder.add_picture(message.name, message.content)
                     elif hooks.event is not None:
                         hooks.event(message)
         else:
@@ -128,134 +135,102 @@ def run(
         stopped_by = str(error)
     except KeyboardInterrupt:
         stopped_by = "interrupted"
-    rounds = tuple(done[key] for key in sorted(done))
-    folder.rewrite(rounds)
-    return Run(settings, workers, model, serving, rounds, stopped_by)
+    records = tuple(done[key] for key in sorted(done))
+    folder.rewrite(records)
+    return Run(settings, workers, model, serving, records, stopped_by)
 
 
 @dataclass(frozen=True, slots=True)
-class _Task:
-    """What a worker needs to play any round."""
+class _Rounds:
+    """What a worker needs to play any round.
+
+    Args:
+        settings, objects: of the run.
+        url: the service; None where each worker has one of its own.
+        model: the network that must answer.
+        watched: whether every observation and attempt is wanted.
+    """
 
     settings: RunSettings
     objects: tuple[ObjectModel, ...]
-    url: str
-    folder: RunFolder
+    url: str | None
+    model: ModelRecord
     watched: bool
 
+    def name(self, job: _RoundKey) -> str:
+        """A round in words."""
+        seed, number = job
+        return f"round {number} of seed {seed}"
 
-@dataclass(slots=True)
-class _Worker:
-    """A worker process and the round it was given last."""
+    @contextmanager
+    def begin(self) -> Iterator[Work[_RoundKey]]:
+        """A planner and what plays rounds with it.
 
-    process: BaseProcess
-    connection: Connection
-    playing: tuple[int, int] | None = None
+        Raises:
+            RunBroken: a service of the worker's own does not start, or serves another network.
+        """
+        photographer = Photographer(self.settings)
+        with ExitStack() as stack:
+            planner = stack.enter_context(
+                HttpPlanner(self._service(stack), self.settings.model, self.settings.max_grasps)
+            )
+            self._check(planner)
+
+            def play(job: _RoundKey, emit: Emit) -> RoundRecord:
+                def listen(event: Observed | Attempted) -> None:
+                    for picture in photographer(event):
+                        emit(picture)
+                    if self.watched:
+                        emit(event)
+
+                segmentation = self.watched or photographer.wants(*job)
+                try:
+                    return play_round(self.settings, self.objects, planner, *job, listen, segmentation=segmentation)
+                except SimError as error:
+                    raise RunBroken(f"{self.name(job)}: {error}") from error
+
+            yield play
+
+    def _service(self, stack: ExitStack) -> str:
+        """URL of the service that the worker asks."""
+        if self.url is not None:
+            return self.url
+        folder = stack.enter_context(TemporaryDirectory(prefix="simharness-"))
+        return stack.enter_context(LocalService(self.settings.model, Path(folder) / SERVICE_LOG)).url
+
+    def _check(self, planner: HttpPlanner) -> None:
+        if self.url is None and (model := planner.model()[0]) != self.model:
+            raise RunBroken(
+                f"a worker's service has another model than this machine's ({model}, here {self.model}); install the "
+                "same version and weights on every machine of the cluster"
+            )
 
 
-_Message = tuple[Literal["event", "round", "broken"], Any]
-
-
-def _play_in_workers(
-    task: _Task, todo: deque[tuple[int, int]], count: int, service: LocalService | None
-) -> Iterator[RoundRecord | Observed | Attempted]:
-    """Rounds (and events, where they are wanted) as they come.
+def _play(rounds: Crew[_RoundKey], todo: Sequence[_RoundKey], service: LocalService | None) -> Iterator[Any]:
+    """Records of the rounds, and what was emitted on the way, as they come.
 
     Raises:
         RunBroken: the service or a worker failed.
     """
-    with _workers(task, count) as workers:
-        for worker in workers:
-            _give(worker, todo)
-        while busy := [worker for worker in workers if worker.playing is not None]:
-            ready = wait([worker.connection for worker in busy], timeout=_LOOK_AFTER_SERVICE_S)
-            if not ready and service is not None and service.died is not None:
-                raise RunBroken(service.died)
-            for worker in busy:
-                if worker.connection not in ready:
-                    continue
-                kind, content = _receive(worker)
-                if kind == "broken":
-                    raise RunBroken(f"{service.died or content}" if service is not None else content)
-                if kind == "round":
-                    _give(worker, todo)
-                yield content
+    for job in todo:
+        rounds.give(job)
+    left = len(todo)
+    while left:
+        for message in _hear(rounds, service):
+            left -= isinstance(message, Done)
+            yield message.result if isinstance(message, Done) else message.content
 
 
-def _give(worker: _Worker, todo: deque[tuple[int, int]]) -> None:
-    worker.playing = todo.popleft() if todo else None
-    if worker.playing is not None:
-        try:
-            worker.connection.send(worker.playing)
-        except OSError:
-            raise RunBroken(_how_it_ended(worker)) from None
+def _hear(rounds: Crew[_RoundKey], service: LocalService | None) -> Sequence[Event | Done[_RoundKey]]:
+    """What the workers say next.
 
-
-def _receive(worker: _Worker) -> _Message:
+    Raises:
+        RunBroken: a worker failed, or the service, which is then the one whose last words are told.
+    """
     try:
-        message: _Message = worker.connection.recv()
-    except (EOFError, OSError):
-        raise RunBroken(_how_it_ended(worker)) from None
-    return message
-
-
-def _how_it_ended(worker: _Worker) -> str:
-    worker.process.join(_WORKER_STOPS_WITHIN_S)
-    code = worker.process.exitcode
-    how = f"was killed by signal {-code}" if code is not None and code < 0 else f"ended with code {code}"
-    where = "" if worker.playing is None else f" in round {worker.playing[1]} of seed {worker.playing[0]}"
-    return f"a worker process {how}{where}; --resume continues the run"
-
-
-@contextmanager
-def _workers(task: _Task, count: int) -> Iterator[list[_Worker]]:
-    """Processes that end with the context, however it is left."""
-    context = multiprocessing.get_context("spawn")
-    workers: list[_Worker] = []
-    try:
-        for number in range(count):
-            ours, theirs = context.Pipe()
-            process = context.Process(target=_work, args=(theirs, task), name=f"round-worker-{number}", daemon=True)
-            process.start()
-            # Without our copy of its end, a dead worker's pipe reports the end of the file.
-            theirs.close()
-            workers.append(_Worker(process, ours))
-        yield workers
-    finally:
-        for worker in workers:
-            worker.connection.close()
-            if worker.playing is not None:
-                worker.process.terminate()
-        for worker in workers:
-            worker.process.join(_WORKER_STOPS_WITHIN_S)
-            if worker.process.is_alive():
-                worker.process.kill()
-                worker.process.join()
-
-
-def _work(connection: Connection, task: _Task) -> None:
-    """A worker's life: rounds until the other end of the pipe is closed, by its owner or by its owner's death."""
-    # Ctrl-C reaches every process of the terminal; the parent decides what it means.
-    signal.signal(signal.SIGINT, signal.SIG_IGN)
-    photographer = Photographer(task.settings, task.folder.pictures)
-
-    def listen(event: Observed | Attempted) -> None:
-        photographer(event)
-        if task.watched:
-            connection.send(("event", event))
-
-    try:
-        with HttpPlanner(task.url, task.settings.model, task.settings.max_grasps) as planner:
-            while True:
-                seed, number = connection.recv()
-                try:
-                    segmentation = task.watched or photographer.wants(seed, number)
-                    record = play_round(
-                        task.settings, task.objects, planner, seed, number, listen, segmentation=segmentation
-                    )
-                except SimError as error:
-                    connection.send(("broken", f"round {number} of seed {seed}: {error}"))
-                    return
-                connection.send(("round", record))
-    except (EOFError, BrokenPipeError):
-        return
+        heard = rounds.hear(_LOOK_AFTER_SERVICE_S)
+    except RunBroken as error:
+        raise RunBroken((service.died if service is not None else None) or str(error)) from error
+    if not heard and service is not None and service.died is not None:
+        raise RunBroken(service.died)
+    return heard

@@ -30,6 +30,9 @@ class CandidateConfig:
         min_offset, max_offset: limits of d . n_c, so that one fingertip closes onto the contact point from outside.
         max_upward: largest z . up of the direction of travel.
         support_clearance: least distance of the hand from the support plane.
+        levelled_within_deg: where up is known, a contact normal that deviates less than this from the horizontal is
+            taken to be horizontal. Most walls that fingers close on are upright, the noise of a normal tilts the hand,
+            and beside a flat object the lower finger of a tilted hand meets the table.
     """
 
     max_pair_distance: float = 0.038
@@ -39,6 +42,7 @@ class CandidateConfig:
     max_offset: float = 0.038
     max_upward: float = 0.1
     support_clearance: float = 0.004
+    levelled_within_deg: float = 25.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -101,8 +105,9 @@ def _search(
     cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, approach_points: Tensor
 ) -> tuple[Candidates, Tensor, dict[str, int]]:
     """The pairs in reach of the approach points, a mask of those that no rule drops, and how many each rule does."""
-    approach, contact = pairs_in_reach(cloud, approach_points, config)
-    poses = grasp_poses(cloud.points[approach], cloud.points[contact], cloud.normals[contact])
+    normals = contact_normals(cloud, config)
+    approach, contact = pairs_in_reach(cloud.points, normals, approach_points, config)
+    poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact])
     candidates = Candidates(approach, contact, poses)
     masks = {
         "from_below": _comes_from_behind(cloud, candidates, config),
@@ -148,10 +153,29 @@ def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
     return chosen
 
 
-def pairs_in_reach(cloud: PreparedCloud, approach_points: Tensor, config: CandidateConfig) -> tuple[Tensor, Tensor]:
-    """Indices (C,), (C,) of approach and contact points that satisfy the limits on distance, depth and offset."""
-    offsets = cloud.points[None] - cloud.points[approach_points][:, None]
-    along_normal = (offsets * cloud.normals[None]).sum(dim=2)
+def contact_normals(cloud: PreparedCloud, config: CandidateConfig) -> Tensor:
+    """(P, 3) the points' normals as candidates close along them: nearly horizontal ones are levelled."""
+    if cloud.up is None:
+        return cloud.normals
+    rise = cloud.normals @ cloud.up
+    level = torch.nn.functional.normalize(cloud.normals - rise[:, None] * cloud.up, dim=1)
+    nearly_level = rise.abs() < math.sin(math.radians(config.levelled_within_deg))
+    return torch.where(nearly_level[:, None], level, cloud.normals)
+
+
+def pairs_in_reach(
+    points: Tensor, normals: Tensor, approach_points: Tensor, config: CandidateConfig
+) -> tuple[Tensor, Tensor]:
+    """Indices (C,), (C,) of approach and contact points that satisfy the limits on distance, depth and offset.
+
+    Args:
+        points: (P, 3).
+        normals: (P, 3) as contact points.
+        approach_points: (A,) indices.
+        config: the limits.
+    """
+    offsets = points[None] - points[approach_points][:, None]
+    along_normal = (offsets * normals[None]).sum(dim=2)
     square = offsets.square().sum(dim=2)
     depth = (square - along_normal.square()).clamp(min=0).sqrt()
     ok = (

@@ -202,6 +202,21 @@ def canonical_frame(points: Tensor, viewpoints: Tensor, up: Tensor | None) -> Po
     return Pose(rotation.cpu().numpy(), centroid.cpu().numpy())
 
 
+def sight_axes(points: Tensor, viewpoint: Tensor) -> Tensor:
+    """(3, 3) axes, as columns, that move with points (P, 3) and their viewpoint (3,): z points away from the viewer.
+
+    z goes from the viewpoint to the points' centroid; x from there towards the point farthest across z.
+    """
+    rays = points - points.mean(dim=0)
+    z = torch.nn.functional.normalize(points.mean(dim=0) - viewpoint, dim=0)
+    across = rays - (rays @ z)[:, None] * z
+    x = across[across.norm(dim=1).argmax()]
+    if float(x.norm()) < 1e-6:  # all in one line of sight
+        x = torch.linalg.cross(z, torch.eye(3, dtype=points.dtype, device=points.device)[z.abs().argmin()])
+    x = torch.nn.functional.normalize(x, dim=0)
+    return torch.stack([x, torch.linalg.cross(z, x), z], dim=1)
+
+
 def _unit_or_none(vector: Tensor) -> Tensor | None:
     length = vector.norm()
     return None if float(length) < 1e-6 else vector / length

@@ -10,6 +10,7 @@ from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
+from tesnet.visibility import depth_behind
 
 SHADOW_MARGIN = 0.01
 """A place is hidden when it lies this far behind the surface that covers it."""
@@ -78,15 +79,11 @@ def points_in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tenso
 def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float) -> Tensor:
     """Mask (C,): part of the hand at the grasp lies where every viewpoint's sight is blocked by observed points.
 
-    The fingers and the palm's front are sampled; each viewpoint's nearest range in every direction is kept in an image
-    whose pixels are about as wide as the spacing of the cloud.
+    The fingers and the palm's front are sampled.
     """
     samples = torch.tensor(_hand_samples(gripper, width), dtype=torch.float32, device=cloud.points.device)
     places = samples @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
-    hidden = torch.ones(places.shape[:2], dtype=torch.bool, device=places.device)
-    for viewpoint in cloud.viewpoints:
-        hidden &= _hidden_from(viewpoint, cloud.points, places)
-    return hidden.any(dim=1)
+    return (depth_behind(cloud, places) > SHADOW_MARGIN).any(dim=1)
 
 
 def _hand_samples(gripper: Gripper, width: float) -> list[list[float]]:
@@ -100,36 +97,3 @@ def _hand_samples(gripper: Gripper, width: float) -> list[list[float]]:
     ]
     palm = [[0.0, gripper.palm_length / 2 * share, palm_front - 0.005] for share in (-0.9, -0.45, 0.0, 0.45, 0.9)]
     return fingers + palm
-
-
-def _hidden_from(viewpoint: Tensor, points: Tensor, places: Tensor) -> Tensor:
-    """Mask (C, S) of places (C, S, 3) more than `SHADOW_MARGIN` behind a point seen in the same direction."""
-    rays = points - viewpoint
-    axis = torch.nn.functional.normalize(rays.mean(dim=0), dim=0)
-    helper = torch.eye(3, dtype=points.dtype, device=points.device)[axis.abs().argmin()]
-    across = torch.nn.functional.normalize(torch.linalg.cross(axis, helper), dim=0)
-    basis = torch.stack([across, torch.linalg.cross(axis, across), axis], dim=1)
-
-    def project(vectors: Tensor) -> tuple[Tensor, Tensor]:
-        local = vectors @ basis
-        ahead = local[..., 2].clamp(min=1e-6)
-        return local[..., :2] / ahead[..., None], local[..., 2]
-
-    plane, depth = project(rays)
-    seen = depth > 0
-    plane, depth = plane[seen], depth[seen]
-    if len(depth) == 0:
-        return torch.zeros(places.shape[:2], dtype=torch.bool, device=places.device)
-    # The spacing of the prepared points is near constant, so its angle is spacing / depth.
-    low, high = plane.min(dim=0).values, plane.max(dim=0).values
-    pixel = torch.clamp((high - low).max() / 512, min=float(0.006 / depth.median()))
-    columns = int((high[1] - low[1]) / pixel) + 1
-    rows = int((high[0] - low[0]) / pixel) + 1
-    cells = ((plane - low) / pixel).long()
-    nearest = torch.full((rows * columns,), torch.inf, device=points.device)
-    nearest = nearest.scatter_reduce(0, cells[:, 0] * columns + cells[:, 1], depth, "amin")
-    place_plane, place_depth = project(places - viewpoint)
-    place_cells = ((place_plane - low) / pixel).floor().long()
-    inside = ((place_cells >= 0) & (place_cells < torch.tensor([rows, columns], device=places.device))).all(dim=2)
-    flat = (place_cells[..., 0] * columns + place_cells[..., 1]).clamp(0, rows * columns - 1)
-    return inside & (place_depth > 0) & (place_depth > nearest[flat] + SHADOW_MARGIN)

@@ -86,20 +86,13 @@ class GraspPredictor:
         chosen = _device(device)
         if num_threads is not None:
             torch.set_num_threads(num_threads)
-        state_dict, header = weights.load(path)
+        network, header = networks.load(path)
         try:
-            network = networks.build(header.network, header.configuration["network"])
-            configuration = {
-                name: dict(header.configuration[name]) for name in ("network", "preparation", "candidates")
-            }
-            model = ModelInfo(
-                header.network, header.version, weights.sha256(path), header.training or {}, configuration
-            )
-            weights.verify(path, state_dict, {name: tensor.shape for name, tensor in network.state_dict().items()})
-            network.load_state_dict(state_dict)
-            return cls(network.to(chosen).eval(), configuration, header.calibration, model, chosen)
+            sections = {name: dict(header.configuration[name]) for name in ("network", "preparation", "candidates")}
+            model = ModelInfo(header.network, header.version, weights.sha256(path), header.training or {}, sections)
+            return cls(network.to(chosen), sections, header.calibration, model, chosen)
         except (KeyError, TypeError, ValueError) as error:
-            why = f"its configuration does not build a network of this version ({error}); get matching weights"
+            why = f"its configuration is not of this version ({error}); get matching weights"
             raise WeightsError(path, why) from error
 
     def warm_up(self) -> None:

@@ -43,10 +43,16 @@ class ServiceProcess:
         """Where it listens."""
         return next(str(line["url"]) for line in self.lines if line["event"] == "listening")
 
+    def parse(self, text: str) -> dict[str, Any] | None:
+        """A line of the log; None for one to pass over, of which the service itself writes none."""
+        return dict(json.loads(text))
+
     def read(self) -> None:
         assert self.process.stdout is not None
         for text in self.process.stdout:
-            line = json.loads(text)
+            line = self.parse(text)
+            if line is None:
+                continue
             self.lines.append(line)
             self.arrived.put(line)
         self.arrived.put(None)
@@ -56,7 +62,9 @@ StartService = Callable[..., Any]
 
 
 @contextmanager
-def running_service(command: list[str], environment: Mapping[str, str]) -> Iterator[ServiceProcess]:
+def running_service(
+    command: list[str], environment: Mapping[str, str], kind: type[ServiceProcess] = ServiceProcess
+) -> Iterator[ServiceProcess]:
     process = subprocess.Popen(
         command,
         env={**os.environ, "GRASP_HOST": "127.0.0.1", "GRASP_PORT": "0", "GRASP_DEVICE": "cpu", **environment},
@@ -64,7 +72,7 @@ def running_service(command: list[str], environment: Mapping[str, str]) -> Itera
         stderr=subprocess.PIPE,
         text=True,
     )
-    service = ServiceProcess(process)
+    service = kind(process)
     reader = threading.Thread(target=service.read, daemon=True)
     reader.start()
     try:

@@ -28,8 +28,8 @@ ALSO = {"pybullet": {"pybullet_data"}, "fastapi": {"starlette"}}
 EXTRAS = {
     "client": (),
     "tesnet": ("service",),
-    "service": ("service",),
-    "simharness": ("sim",),
+    "service": ("service", "ray"),  # of which only service.deploy.ray needs Ray
+    "simharness": ("sim", "ray"),  # of which only the option --ray needs Ray
     "training": ("service", "sim"),
     "bench": ("service", "dev"),  # fuzzing needs what generates requests
 }
@@ -80,6 +80,7 @@ def test_every_declared_dependency_of_an_extra_is_imported_by_its_packages() -> 
         ("files",): ("tesnet",),
         ("service",): ("tesnet", "service"),
         ("sim",): ("simharness",),
+        ("ray",): ("service",),
     }.items():
         used = {name for package in packages for path in (ROOT / package).rglob("*.py") for name in _imported(path)}
         core = _declared(()) if extra else set()

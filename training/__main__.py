@@ -1,4 +1,4 @@
-"""`python -m training generate|fit|evaluate`: labels, weights and their measures."""
+"""`python -m training generate|pack|unpack|fit|evaluate`: labels, weights and their measures."""
 
 from __future__ import annotations
 
@@ -12,10 +12,11 @@ from typing import get_args
 from simharness.camera import Preset
 from simharness.errors import SimError
 from tesnet.errors import TesnetError
+from training.archive import is_archive, pack, unpack
 from training.evaluate import evaluate
 from training.fit import PRESETS, fit
 from training.generate import GenerateConfig, generate
-from training.labels import LabelsError
+from training.views import LabelsError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -34,6 +35,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(prog="python -m training", description=__doc__)
     commands = parser.add_subparsers(required=True)
     _add_generate(commands.add_parser("generate", help="simulate grasps and store their outcomes"))
+    _add_pack(commands.add_parser("pack", help="put stored labels into a small archive"))
+    _add_unpack(commands.add_parser("unpack", help="render the clouds of an archive again"))
     _add_fit(commands.add_parser("fit", help="train a network on stored labels"))
     _add_evaluate(commands.add_parser("evaluate", help="measure a network on stored labels"))
     return parser
@@ -46,6 +49,15 @@ def _positive(text: str) -> int:
     return value
 
 
+def _share(text: str) -> float | None:
+    if text == "natural":
+        return None
+    value = float(text)
+    if not 0 <= value <= 1:
+        raise argparse.ArgumentTypeError(f"{text} is not in 0 to 1")
+    return value
+
+
 def _add_generate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", choices=("packed", "pile"), required=True)
     parser.add_argument("--objects", required=True, help="object sets, joined with commas: names, folders or lists")
@@ -53,10 +65,19 @@ def _add_generate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--labels", type=_positive, required=True, help="how many, all runs on --out together")
     parser.add_argument("--views", type=_positive, default=2, help="camera views of each scene")
     parser.add_argument("--labels-per-view", type=_positive, default=320)
-    parser.add_argument("--colliding-share", type=float, default=0.7, help="part of the labels from blocked candidates")
+    parser.add_argument(
+        "--colliding-share",
+        type=_share,
+        default=0.7,
+        help="part of the labels from candidates that the observed cloud blocks; 'natural' draws from all alike",
+    )
+    parser.add_argument(
+        "--mine", type=Path, metavar="WEIGHTS", help="draw half of the others from what these score best"
+    )
     parser.add_argument("--camera", choices=get_args(Preset), default="random")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=_positive, default=1)
+    parser.add_argument("--ray", metavar="ADDRESS", help="make the scenes on this Ray cluster")
     parser.add_argument("--out", type=Path, required=True)
     parser.add_argument("--resume", action="store_true", help="go on where an earlier run stopped")
     parser.set_defaults(run=_generate)
@@ -71,14 +92,32 @@ def _generate(options: argparse.Namespace) -> dict[str, object]:
         views=options.views,
         labels_per_view=options.labels_per_view,
         colliding_share=options.colliding_share,
+        mine=options.mine,
         camera=options.camera,
     )
-    return generate(config, options.labels, options.workers, options.out, options.resume)
+    return generate(config, options.labels, options.workers, options.out, options.resume, options.ray)
+
+
+def _add_pack(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, nargs="+", required=True, help="folders of labelled scenes")
+    parser.add_argument("--out", type=Path, required=True, help="folder for the archive")
+    parser.set_defaults(run=lambda options: pack(options.data, options.out))
+
+
+def _add_unpack(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--archive", type=Path, required=True)
+    parser.add_argument("--objects", required=True, help="the sets that hold its objects, joined with commas")
+    parser.add_argument("--workers", type=_positive, default=1)
+    parser.add_argument("--out", type=Path, required=True, help="folder for the scenes; what is there stays")
+    parser.set_defaults(run=lambda options: unpack(options.archive, options.objects, options.out, options.workers))
 
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--model", default="tesnet")
-    parser.add_argument("--data", type=Path, nargs="+", required=True, help="folders of labelled training scenes")
+    parser.add_argument(
+        "--data", type=Path, nargs="+", required=True, help="folders of labelled training scenes, or archives"
+    )
+    parser.add_argument("--objects", help="for archives: the sets that hold their objects, joined with commas")
     parser.add_argument(
         "--validation", type=Path, nargs="+", required=True, help="folders of labelled validation scenes"
     )
@@ -92,9 +131,10 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
 
 
 def _fit(options: argparse.Namespace) -> dict[str, object]:
+    data = [_rendered(folder, options) if is_archive(folder) else folder for folder in options.data]
     return fit(
         options.model,
-        options.data,
+        data,
         options.validation,
         PRESETS[options.preset],
         options.out,
@@ -103,6 +143,15 @@ def _fit(options: argparse.Namespace) -> dict[str, object]:
         seed=options.seed,
         version=options.version,
     )
+
+
+def _rendered(archive: Path, options: argparse.Namespace) -> Path:
+    """The scenes of an archive, rendered into a folder beside the weights unless they are there."""
+    if options.objects is None:
+        raise LabelsError(f"{archive} is an archive, whose clouds are rendered again; name its objects with --objects")
+    folder: Path = options.out.parent / f"{archive.name}-rendered"
+    unpack(archive, options.objects, folder, options.threads)
+    return folder
 
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:

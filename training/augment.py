@@ -8,7 +8,7 @@ import numpy as np
 import torch
 
 from tesnet.geometry import Pose
-from training.labels import LabelledView
+from training.views import LabelledView
 
 WITHHOLD_UP = 0.1
 WITHHOLD_SUPPORT = 0.1
@@ -40,10 +40,8 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
         support_height=height if keep_up and chance >= WITHHOLD_UP + WITHHOLD_SUPPORT else None,
         T_cloud_canonical=cloud.T_cloud_canonical @ Pose(rotation, rotation @ -centre.double().numpy()).inverse(),
     )
-    T_turned_cloud = torch.eye(4)
-    T_turned_cloud[:3, :3], T_turned_cloud[:3, 3] = turn, -turn @ centre
-    candidates = replace(view.candidates, Ts_canonical_grasp=T_turned_cloud @ view.candidates.Ts_canonical_grasp)
-    return replace(view, cloud=turned, candidates=candidates)
+    shift = torch.stack([centre, centre, torch.zeros(3)])  # two points and a direction
+    return replace(view, cloud=turned, pairs=(view.pairs - shift) @ turn.T)
 
 
 def random_rotation(rng: np.random.Generator) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:

@@ -12,42 +12,50 @@ import torch
 from tesnet import networks, weights
 from tesnet.networks import Network
 from training import metrics
-from training.labels import LabelledView, LabelsError, load_views
+from training.views import LabelledView, LabelsError, load_views
 
 
 def evaluate(name: str, path: Path | None, data: Sequence[Path], seed: int = 0) -> dict[str, Any]:
     """Measures of the weights at `path` (those shipped for the network `name` unless given), overall and by scene.
+
+    They are of candidates that the observed cloud leaves free, which the service ranks; under `with_blocked`, of all
+    candidates, as published tests have them. For the latter the labels must be drawn from all candidates alike.
 
     Raises:
         WeightsError: weights that cannot be used.
         LabelsError: folders without labels.
     """
     path = path or weights.default_weights(name)
-    state_dict, header = weights.load(path)
-    network = networks.build(header.network, header.configuration["network"])
-    weights.verify(path, state_dict, {key: tensor.shape for key, tensor in network.state_dict().items()})
-    network.load_state_dict(state_dict)
+    network, header = networks.load(path)
     views = list(load_views(data))
-    result = {
-        "weights_sha256": weights.sha256(path),
-        "all": measure(score_views(network, views), seed, header.calibration),
+    groups = {"all": views} | {
+        scene: [view for view in views if view.scene == scene] for scene in sorted({view.scene for view in views})
     }
-    for scene in sorted({view.scene for view in views}):
-        chosen = [view for view in views if view.scene == scene]
-        result[scene] = measure(score_views(network, chosen), seed, header.calibration)
+
+    def measures(*, blocked: bool) -> dict[str, Any]:
+        return {
+            group: measure(score_views(network, chosen, blocked=blocked), seed, header.calibration)
+            for group, chosen in groups.items()
+        }
+
+    result: dict[str, Any] = {"weights_sha256": weights.sha256(path), **measures(blocked=False)}
+    if not all(bool(view.collision_free.all()) for view in views):
+        result["with_blocked"] = measures(blocked=True)
     return result
 
 
 @torch.inference_mode()
-def score_views(network: Network, views: Sequence[LabelledView]) -> list[tuple[metrics.Logits, metrics.Success]]:
-    """Logits and outcomes of every view's candidates that the observed cloud leaves free."""
+def score_views(
+    network: Network, views: Sequence[LabelledView], *, blocked: bool = False
+) -> list[tuple[metrics.Logits, metrics.Success]]:
+    """Logits and outcomes of every view's candidates that the observed cloud leaves free, or, if asked for, of all."""
     network.eval()
     scored = []
     for view in views:
-        free = view.collision_free.nonzero()[:, 0]
-        if len(free):
-            logits = network.score(network.encode(view.cloud), view.cloud, view.candidates.select(free))
-            scored.append((logits.double().numpy(), view.success[free].numpy()))
+        which = torch.arange(len(view.outcomes)) if blocked else view.collision_free.nonzero()[:, 0]
+        if len(which):
+            logits = network.score(network.encode(view.cloud), view.cloud, view.candidates.select(which))
+            scored.append((logits.double().numpy(), view.success[which].numpy()))
     return scored
 
 
@@ -59,7 +67,8 @@ def measure(
     Args:
         scored: logits and outcomes, a pair a view.
         seed: of the subsampling.
-        calibration: (a, b) of the served score; fitted here when not given.
+        calibration: (a, b) of the served score. When not given, it is fitted to every other view, and its error is
+            that on the remaining ones.
     """
     usable = [view for view in scored if metrics.usable(view[1])]
     if not usable:
@@ -67,9 +76,11 @@ def measure(
             f"none of {len(scored)} views has {metrics.FEWEST_POSITIVES} successes and a failure; label more candidates"
         )
     accuracy, loss = metrics.edge_metric(usable, seed)
-    logits = np.concatenate([view[0] for view in scored])
-    success = np.concatenate([view[1] for view in scored])
-    a, b = calibration or metrics.fit_calibration(logits, success)
+    logits, success = _joined(scored)
+    judged = scored if calibration or len(scored) == 1 else scored[1::2]
+    a, b = calibration or metrics.fit_calibration(*_joined(scored[::2]))
+    judged_logits, judged_success = _joined(judged)
+    probabilities = 1 / (1 + np.exp(-(a * judged_logits + b)))
     return {
         "views": len(scored),
         "usable_views": len(usable),
@@ -81,6 +92,10 @@ def measure(
         "auroc": metrics.auroc(logits, success),
         "average_precision": metrics.average_precision(logits, success),
         "calibration": [a, b],
-        "calibration_error": metrics.calibration_error(1 / (1 + np.exp(-(a * logits + b))), success),
+        "calibration_error": metrics.calibration_error(probabilities, judged_success),
         "top1": float(np.mean([view[1][view[0].argmax()] for view in scored])),
     }
+
+
+def _joined(scored: Sequence[tuple[metrics.Logits, metrics.Success]]) -> tuple[metrics.Logits, metrics.Success]:
+    return np.concatenate([view[0] for view in scored]), np.concatenate([view[1] for view in scored])

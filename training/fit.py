@@ -23,7 +23,7 @@ from tesnet.predictor import configuration_of
 from training import metrics
 from training.augment import augment
 from training.evaluate import measure, score_views
-from training.labels import LabelledView, LabelsError, load_views, scene_files
+from training.views import LabelledView, LabelsError, load_views, scene_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -49,7 +49,7 @@ class Recipe:
     weight_decay: float = 1e-4
     patience: int = 2
     smallest_learning_rate: float = 5e-5
-    max_epochs: int = 9
+    max_epochs: int = 10
     cosine: bool = True
     views_per_step: int = 4
     candidates_per_view: int = 120

@@ -6,30 +6,38 @@ Each scene is one job and one file, so a run that is stopped goes on where it wa
 from __future__ import annotations
 
 import json
-import multiprocessing
+import math
 import os
 import time
-from collections.abc import Sequence
+from collections import deque
+from collections.abc import Iterator, Sequence
+from contextlib import contextmanager
 from dataclasses import asdict, dataclass
 from pathlib import Path
+from tempfile import TemporaryDirectory
 from typing import Any, Literal
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from tqdm import tqdm
 
-from simharness.camera import Preset, observe
+from simharness.camera import Observation, Preset, observe
+from simharness.crew import Done, Emit, Event, Work, crew
 from simharness.execute import label_strict, snapshot_of
 from simharness.hand import Hand
 from simharness.objects import ObjectModel, load_object_set
 from simharness.scene import PERCEPTION_BOX, TABLE_HEIGHT, describe, make_scene
 from simharness.world import World
-from tesnet import candidates, cloud
+from tesnet import candidates, cloud, networks
 from tesnet.collision import in_collision
 from tesnet.geometry import PANDA
+from tesnet.networks import Network
 from tesnet.predictor import APPROACH_DISTANCE
 from tesnet.query import GraspQuery
-from training.labels import OUTCOMES, LabelledView, LabelsError, save_scene, scene_files
+from training.views import OUTCOMES, LabelledView, LabelsError, pairs_of, save_scene, scene_files
+
+_HEAR_S = 1.0
 
 
 @dataclass(frozen=True, slots=True)
@@ -43,7 +51,10 @@ class GenerateConfig:
         seed: scene i of a seed is the same whatever else is asked for.
         views: camera views of each scene.
         labels_per_view: at most this many candidates of a view are tried.
-        colliding_share: the part of them drawn from candidates that collide with the observed cloud.
+        colliding_share: the part of them drawn from candidates that collide with the observed cloud; None draws from
+            all candidates alike.
+        mine: weights of a network; half of the candidates that do not collide are then drawn from the quarter that it
+            scores best, where its mistakes become failed attempts.
         camera: preset.
     """
 
@@ -53,15 +64,27 @@ class GenerateConfig:
     seed: int = 0
     views: int = 2
     labels_per_view: int = 320
-    colliding_share: float = 0.7
+    colliding_share: float | None = 0.7
+    mine: Path | None = None
     camera: Preset = "random"
 
 
-def generate(config: GenerateConfig, labels: int, workers: int, out: Path, resume: bool = False) -> dict[str, Any]:
+def generate(
+    config: GenerateConfig, labels: int, workers: int, out: Path, resume: bool = False, ray: str | None = None
+) -> dict[str, Any]:
     """Writes scenes to `out` until they hold `labels` labels; returns and stores the account of what is there.
+
+    Args:
+        config: what is generated.
+        labels: how many.
+        workers: how many scenes are made at a time.
+        out: folder for the scenes.
+        resume: whether to go on with what `out` holds.
+        ray: address of a Ray cluster that makes the scenes; None for processes on this machine.
 
     Raises:
         LabelsError: `out` holds scenes and `resume` is not set, or scenes of another configuration.
+        SimError: there is no such cluster, or a worker failed.
     """
     out.mkdir(parents=True, exist_ok=True)
     settings = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(config).items()}
@@ -74,21 +97,25 @@ def generate(config: GenerateConfig, labels: int, workers: int, out: Path, resum
             counts += stored["counts"]
     started, fresh, busy_s = time.monotonic(), 0, 0.0
     pending = (number for number in range(10**9) if number not in done)
-    context = multiprocessing.get_context("spawn")
-    with context.Pool(workers, _start_worker, (config, out)) as pool, tqdm(total=labels, unit="label") as progress:
+    with crew(_Scenes(config), workers, ray) as makers, tqdm(total=labels, unit="label") as progress:
         progress.update(int(counts.sum()))
-        jobs: list[Any] = []
-        while counts.sum() < labels:
-            while len(jobs) < 2 * workers:
-                jobs.append(pool.apply_async(_make_scene_file, (next(pending),)))
-            scene_counts, seconds = jobs.pop(0).get()
-            counts += scene_counts
-            fresh += int(scene_counts.sum())
-            busy_s += seconds
-            progress.update(int(scene_counts.sum()))
+        given: deque[int] = deque()
+        made: dict[int, _Made] = {}
+        while True:
+            while counts.sum() < labels and len(given) < 2 * workers:
+                given.append(next(pending))
+                makers.give(given[-1])
+            if not given:
+                break
+            # One scene at a time and in their order, so that which ones are made depends on no worker's speed.
+            while given[0] not in made:
+                made |= _made(makers.hear(_HEAR_S), out)
+            scene = made.pop(given.popleft())
+            counts += scene.counts
+            fresh += int(scene.counts.sum())
+            busy_s += scene.seconds
+            progress.update(int(scene.counts.sum()))
             progress.set_postfix(success=f"{counts[0] / max(1, counts.sum()):.3f}")
-        for job in jobs:
-            counts += job.get()[0]
     account = {
         "settings": settings,
         "labels": int(counts.sum()),
@@ -126,68 +153,120 @@ def object_sets(config: GenerateConfig) -> list[tuple[ObjectModel, ...]]:
     return [load_object_set(name, config.scene, exclude=config.exclude) for name in config.objects.split(",")]
 
 
-_worker: tuple[GenerateConfig, Path, list[tuple[ObjectModel, ...]]]
+@dataclass(frozen=True, eq=False, slots=True)
+class _Made:
+    """A labelled scene: its file's content, the counts of its outcomes, and the seconds it took."""
+
+    content: bytes
+    counts: np.ndarray[Any, np.dtype[np.int64]]
+    seconds: float
 
 
-def _start_worker(config: GenerateConfig, out: Path) -> None:
-    global _worker  # noqa: PLW0603  a pool's initializer has no other way to hand state to its jobs
-    os.nice(10)
-    torch.set_num_threads(1)
-    _worker = (config, out, object_sets(config))
+@dataclass(frozen=True, slots=True)
+class _Scenes:
+    """What a worker needs to make any scene."""
+
+    config: GenerateConfig
+
+    def name(self, job: int) -> str:
+        """A scene in words."""
+        return f"scene {job}"
+
+    @contextmanager
+    def begin(self) -> Iterator[Work[int]]:
+        """The object sets, and what makes scenes of them."""
+        os.nice(10)
+        torch.set_num_threads(1)
+        sets = object_sets(self.config)
+        network = None if self.config.mine is None else networks.load(self.config.mine)[0]
+
+        def make(number: int, _: Emit) -> _Made:
+            started = time.monotonic()
+            description, views = label_scene(self.config, sets, number, network)
+            counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+            for view in views:
+                counts += np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES))
+            with TemporaryDirectory(prefix="scene-") as folder:
+                path = Path(folder) / _file_name(number)
+                save_scene(path, description, views, counts)
+                return _Made(path.read_bytes(), counts, time.monotonic() - started)
+
+        yield make
 
 
-def _make_scene_file(number: int) -> tuple[np.ndarray[Any, np.dtype[np.int64]], float]:
-    """Labels scene `number` and writes it; counts of the outcomes, and the seconds it took."""
-    config, out, sets = _worker
-    started = time.monotonic()
-    description, views = label_scene(config, sets, number)
-    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
-    for view in views:
-        counts += np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES))
-    save_scene(out / f"scene_{number:07d}.npz", description, views, counts)
-    return counts, time.monotonic() - started
+def _made(heard: Sequence[Event | Done[int]], out: Path) -> dict[int, _Made]:
+    """The scenes among what was heard, by number; each is on the disk, as the whole file, when this returns."""
+    scenes: dict[int, _Made] = {message.job: message.result for message in heard if isinstance(message, Done)}
+    for number, scene in scenes.items():
+        path = out / _file_name(number)
+        draft = path.with_name(f".{path.name}.{os.getpid()}")
+        draft.write_bytes(scene.content)
+        draft.replace(path)
+    return scenes
+
+
+def _file_name(number: int) -> str:
+    return f"scene_{number:07d}.npz"
 
 
 def label_scene(
-    config: GenerateConfig, sets: Sequence[tuple[ObjectModel, ...]], number: int
+    config: GenerateConfig, sets: Sequence[tuple[ObjectModel, ...]], number: int, network: Network | None = None
 ) -> tuple[dict[str, Any], list[LabelledView]]:
-    """Makes scene `number`, observes it from `config.views` cameras and tries candidates of each view."""
-    rng = np.random.default_rng([config.seed, number, 0 if config.scene == "packed" else 1])
+    """Makes scene `number`, observes it from `config.views` cameras and tries candidates of each view.
+
+    A view's camera and noise derive from the seed, the scene's number and its own, so that it can be rendered again.
+    """
+    rng = _rng(config, number)
     models = sets[int(rng.integers(len(sets)))]
     with World() as world:
         hand = Hand(world)
         # Fewer objects, too: a table that is being cleared holds fewer and fewer.
         scene = make_scene(world, config.scene, models, rng, num_objects=int(rng.choice([1, 2, 3, 4, 5, 5])))
-        description = describe(scene) | {"seed": config.seed, "number": number, "cameras": []}
+        description = describe(scene) | {"seed": config.seed, "number": number, "camera": config.camera, "cameras": []}
         views: list[LabelledView] = []
         if not scene.placed:
             return description, views
-        for _ in range(config.views):
+        for number_of_view in range(config.views):
+            rng = _rng(config, number, number_of_view)
             observation = observe(world, config.camera, rng)
             description["cameras"].append(observation.Ts_world_camera.tolist())
-            view = _label_view(world, hand, observation.points_world, observation.viewpoints, config, rng)
+            view = _label_view(world, hand, observation, config, rng, network)
             if view is not None:
                 views.append(view)
         return description, views
 
 
-def _label_view(
-    world: World, hand: Hand, points_world: Any, viewpoints: Any, config: GenerateConfig, rng: np.random.Generator
-) -> LabelledView | None:
-    query = GraspQuery(
-        points_world,
-        viewpoints=viewpoints,
+def _rng(config: GenerateConfig, *numbers: int) -> np.random.Generator:
+    return np.random.default_rng([config.seed, 0 if config.scene == "packed" else 1, *numbers])
+
+
+def observed_query(observation: Observation, seed: int = 0) -> GraspQuery:
+    """What the harness would ask about an observation."""
+    return GraspQuery(
+        observation.points_world,
+        viewpoints=observation.viewpoints,
         up=np.array([0.0, 0.0, 1.0]),
         workspace=PERCEPTION_BOX,
         support_height=TABLE_HEIGHT,
-        seed=int(rng.integers(2**31)),
+        seed=seed,
     )
+
+
+def _label_view(
+    world: World,
+    hand: Hand,
+    observation: Observation,
+    config: GenerateConfig,
+    rng: np.random.Generator,
+    network: Network | None,
+) -> LabelledView | None:
+    query = observed_query(observation, seed=int(rng.integers(2**31)))
     prepared = cloud.prepare(query, cloud.PreparationConfig(), torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
     free = ~in_collision(prepared, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
-    chosen = _choose(free.numpy(), config, rng)
+    chosen = _choose(prepared, found, free, config, rng, network)
     if len(chosen) == 0:
         return None
     which = torch.from_numpy(chosen)
@@ -197,18 +276,34 @@ def _label_view(
         kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), PANDA.max_width), snapshot)
     return LabelledView(
         cloud=prepared,
-        candidates=picked,
+        pairs=pairs_of(prepared, picked),
+        approach=picked.approach,
+        contact=picked.contact,
         outcomes=torch.tensor([OUTCOMES.index(kind) for kind in kinds], dtype=torch.uint8),
         collision_free=free[which],
         scene=config.scene,
     )
 
 
-def _choose(free: Any, config: GenerateConfig, rng: np.random.Generator) -> Any:
-    """Indices of the candidates to try: free ones, drawn at random, and some that collide with the observed cloud."""
-    clear, blocked = np.flatnonzero(free), np.flatnonzero(~free)
-    num_blocked = min(len(blocked), round(config.labels_per_view * config.colliding_share))
-    num_clear = min(len(clear), config.labels_per_view - num_blocked)
-    return np.sort(
-        np.concatenate([rng.choice(clear, num_clear, replace=False), rng.choice(blocked, num_blocked, replace=False)])
-    ).astype(np.int64)
+def _choose(
+    prepared: cloud.PreparedCloud,
+    found: candidates.Candidates,
+    free: torch.Tensor,
+    config: GenerateConfig,
+    rng: np.random.Generator,
+    network: Network | None,
+) -> NDArray[np.int64]:
+    """Indices of the candidates to try, in order: free ones and some that collide with the observed cloud."""
+    if config.colliding_share is None:
+        return np.sort(rng.permutation(len(found))[: config.labels_per_view])
+    clear, blocked = (np.flatnonzero(mask.numpy()) for mask in (free, ~free))
+    chosen_blocked = rng.permutation(blocked)[: round(config.labels_per_view * config.colliding_share)]
+    num_clear = config.labels_per_view - len(chosen_blocked)
+    mined = np.empty(0, dtype=np.int64)
+    if network is not None and len(clear):
+        with torch.inference_mode():
+            logits = network.score(network.encode(prepared), prepared, found.select(free))
+        best = clear[logits.argsort(descending=True)[: math.ceil(len(clear) / 4)].numpy()]
+        mined = rng.permutation(best)[: num_clear // 2]
+    others = rng.permutation(np.setdiff1d(clear, mined))[: num_clear - len(mined)]
+    return np.sort(np.concatenate([mined, others, chosen_blocked]))

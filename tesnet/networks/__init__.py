@@ -3,8 +3,11 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
+from pathlib import Path
 from typing import Any
 
+from tesnet import weights
+from tesnet.errors import WeightsError
 from tesnet.networks.tesnet import TesNet, TesNetConfig
 
 Network = TesNet
@@ -34,3 +37,20 @@ def build(name: str, config: Mapping[str, Any] | None = None) -> TesNet:
     if unknown:
         raise ValueError(f"unknown configuration {', '.join(unknown)} of {name}; valid: {', '.join(fields)}")
     return network(config_class(**given))
+
+
+def load(path: Path) -> tuple[TesNet, weights.Header]:
+    """The network of a weights file, on the CPU and in evaluation mode, and the file's header.
+
+    Raises:
+        WeightsError: the file is missing, corrupted or does not fit its network.
+    """
+    state_dict, header = weights.load(path)
+    try:
+        network = build(header.network, header.configuration["network"])
+    except (KeyError, TypeError, ValueError) as error:
+        why = f"its configuration does not build a network of this version ({error}); get matching weights"
+        raise WeightsError(path, why) from error
+    weights.verify(path, state_dict, {name: tensor.shape for name, tensor in network.state_dict().items()})
+    network.load_state_dict(state_dict)
+    return network.eval(), header

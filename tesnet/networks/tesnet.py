@@ -7,6 +7,7 @@ encoded once; what a candidate adds is a gather, a small shared MLP over the poi
 
 from __future__ import annotations
 
+import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
 
@@ -16,7 +17,10 @@ from torch import Tensor, nn
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.collision import points_in_grasp_frames
+from tesnet.geometry import PANDA
 from tesnet.layers import PointTransformerConv, SAGEConv
+from tesnet.patches import Patches, group, pool
+from tesnet.visibility import depth_behind
 
 _POINT_INPUTS = 7
 _EDGE_INPUTS = 4
@@ -31,33 +35,40 @@ class TesNetConfig:
     """Widths of the network and the region of the cloud that a candidate sees.
 
     Args:
-        channels: width of every encoder stage.
-        stages: number of PointTransformerConv + SAGEConv stages.
+        channels: width of the encoder stage on the cloud's own points.
+        wide_channels, wide_stages: width and number of the stages on patches of the cloud, whose neighbourhoods span
+            whole objects.
+        patch_size: edge of the cells whose points make a patch, metres.
         point_features, context_features: width of a point's and of the whole cloud's features.
         region_channels: widths of the shared MLP over the points in the hand's reach.
         head_channels: widths of the head's hidden layers.
-        closing_points, closing_region: at most so many points are looked at where the fingers close. The region is
-            given by half extents along x and y of the grasp frame and extents along -z and +z from the TCP, metres.
-        around_points, around_region: the same for the hand's wider surroundings.
+        closing_points, closing_region: at most so many points are looked at where the fingers close (`RegionPooling`).
+        around_patches, around_region: the same for patches in the hand's wider surroundings.
+        probe_channels: width of the layer over what the camera saw at the hand's probes.
     """
 
     channels: int = 32
-    stages: int = 2
+    wide_channels: int = 64
+    wide_stages: int = 2
+    patch_size: float = 0.011
     point_features: int = 64
     context_features: int = 32
     region_channels: tuple[int, int] = (64, 128)
-    head_channels: tuple[int, int] = (128, 64)
+    head_channels: tuple[int, int] = (192, 96)
+    probe_channels: int = 128
     closing_points: int = 56
     closing_region: tuple[float, float, float, float] = (0.012, 0.045, 0.042, 0.012)
-    around_points: int = 40
+    around_patches: int = 48
     around_region: tuple[float, float, float, float] = (0.035, 0.085, 0.060, 0.045)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
 class CloudFeatures:
-    """What the encoder found: `points` (P, point_features) and `context` (context_features,)."""
+    """What the encoder found: `points` (P, F), `wide` (Q, W) of the Q `patches`, and `context` (context_features,)."""
 
     points: Tensor
+    patches: Patches
+    wide: Tensor
     context: Tensor
 
 
@@ -82,25 +93,98 @@ class EncoderStage(nn.Module):
         return torch.relu(x + self.aggregate_norm(self.aggregate(attended, neighbours)))
 
 
+class RegionPooling(nn.Module):
+    """What lies in a box about each candidate's hand: a shared MLP over the points in it, then the largest of each.
+
+    Args:
+        in_channels: F, features of a point.
+        channels: widths of the MLP.
+        count: at most so many points are looked at; where more lie there, a fixed pseudo-random choice of them.
+        box: half extents along x and y of the grasp frame and extents along -z and +z from the TCP, metres.
+    """
+
+    def __init__(
+        self, in_channels: int, channels: tuple[int, int], count: int, box: tuple[float, float, float, float]
+    ) -> None:
+        super().__init__()
+        self.features = nn.Linear(in_channels, channels[0], bias=False)
+        self.geometry = nn.Linear(_REGION_INPUTS, channels[0])
+        self.update = nn.Linear(channels[0], channels[1])
+        self.count = count
+        self.box = box
+
+    def forward(
+        self, features: Tensor, cloud: PreparedCloud | Patches, poses: Tensor, sign: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Pooled features (C, channels[1]) from features (P, F) of the points, and how many points are there, (C,).
+
+        Args:
+            features: of the cloud's points.
+            cloud: P points with normals.
+            poses: (C, 4, 4) TCP poses.
+            sign: (C,) +1, or -1 to see the surroundings mirrored in the hand's plane.
+        """
+        index, total = self.members(cloud.points, poses)
+        facing = (cloud.normals * cloud.view_directions).sum(dim=1, keepdim=True)
+        table = torch.cat([cloud.points, cloud.normals, facing], dim=1)
+        flat = index.flatten()
+        inputs = table.index_select(0, flat).view(*index.shape, _REGION_INPUTS)
+        gathered = self.features(features).index_select(0, flat).view(*index.shape, self.features.out_features)
+        weight, bias = self._geometry_of(poses, sign)
+        hidden = torch.relu(torch.baddbmm(gathered + bias[:, None], inputs, weight))
+        pooled = torch.relu(self.update(hidden).amax(dim=1))
+        return pooled * (total > 0)[:, None], total
+
+    def _geometry_of(self, poses: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
+        """`geometry` for points and normals that are given in the cloud's frame: weights (C, 7, D) and biases (C, D).
+
+        Turning each candidate's weights is cheaper than turning all points in its box.
+        """
+        mirror = torch.stack([sign, torch.ones_like(sign), torch.ones_like(sign)], dim=1)
+        rotation = poses[:, :3, :3] * mirror[:, None]
+        points, normals, facing = self.geometry.weight.T.split([3, 3, 1])
+        turned = rotation @ (points / _LENGTH)
+        weight = torch.cat([turned, rotation @ normals, facing.expand(len(poses), -1, -1)], dim=1)
+        return weight, self.geometry.bias - (poses[:, None, :3, 3] @ turned)[:, 0]
+
+    def members(self, points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Indices (C, M) of points in each candidate's box, the first repeated where there are fewer; totals (C,)."""
+        shuffled = torch.randperm(len(points), generator=torch.Generator().manual_seed(0)).to(poses.device)
+        x, y, z = points_in_grasp_frames(points[shuffled], poses)
+        breadth, length, behind, ahead = self.box
+        within = (x.abs_() < breadth) & (y.abs_() < length) & (z > -behind) & (z < ahead)
+        rank = within.cumsum(dim=1, dtype=torch.int32)
+        row, column = (within & (rank <= self.count)).nonzero(as_tuple=True)
+        index = shuffled[within.to(torch.uint8).argmax(dim=1)][:, None].repeat(1, self.count)
+        index[row, (rank[row, column] - 1).long()] = shuffled[column]
+        return index, rank[:, -1]
+
+
 class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()
         self.config = config
-        c, f = config.channels, config.point_features
+        c, w, f = config.channels, config.wide_channels, config.point_features
         self.lift = nn.Linear(_POINT_INPUTS, c)
-        self.stages = nn.ModuleList(EncoderStage(c) for _ in range(config.stages))
-        self.merge = nn.Sequential(nn.Linear(c * (config.stages + 1), f), nn.ReLU())
-        self.context = nn.Sequential(nn.Linear(f, config.context_features), nn.ReLU())
-        first, second = config.region_channels
-        self.region_point = nn.Linear(f, first, bias=False)
-        self.region_geometry = nn.Linear(_REGION_INPUTS, first)
-        self.region_mlp = nn.Sequential(nn.ReLU(), nn.Linear(first, second), nn.ReLU())
+        self.stage = EncoderStage(c)
+        self.widen = nn.Linear(2 * c, w)
+        self.wide_stages = nn.ModuleList(EncoderStage(w) for _ in range(config.wide_stages))
+        self.merge_points = nn.Linear(2 * c, f)
+        self.merge_wide = nn.Linear(w * (config.wide_stages + 1), f, bias=False)
+        self.context = nn.Sequential(nn.Linear(w, config.context_features), nn.ReLU())
+        self.closing = RegionPooling(f, config.region_channels, config.closing_points, config.closing_region)
+        self.around = RegionPooling(w, config.region_channels, config.around_patches, config.around_region)
         self.approach = nn.Linear(f, config.head_channels[0], bias=False)
         self.contact = nn.Linear(f, config.head_channels[0], bias=False)
-        self.pooled = nn.Linear(2 * second, config.head_channels[0], bias=False)
+        self.pooled = nn.Linear(2 * config.region_channels[1], config.head_channels[0], bias=False)
         self.candidate = nn.Linear(_CANDIDATE_INPUTS, config.head_channels[0])
+        self.hidden_space = nn.Sequential(
+            nn.Linear(2 * len(_probes()), config.probe_channels),
+            nn.ReLU(),
+            nn.Linear(config.probe_channels, config.head_channels[0], bias=False),
+        )
         self.situation = nn.Linear(config.context_features, config.head_channels[0], bias=False)
         self.head = nn.Sequential(
             nn.ReLU(),
@@ -118,17 +202,29 @@ class TesNet(nn.Module):
 
         They equal those of `encode` up to the rounding of float32, which depends on the size of a matrix product.
         """
-        sizes = [len(cloud) for cloud in clouds]
-        before = [sum(sizes[:i]) for i in range(len(sizes))]
-        x = torch.relu(self.lift(torch.cat([point_inputs(cloud) for cloud in clouds])))
-        edges = torch.cat([edge_inputs(cloud) for cloud in clouds])
-        neighbours = torch.cat([cloud.neighbours + start for cloud, start in zip(clouds, before, strict=True)])
+        all_patches = [group(cloud, self.config.patch_size) for cloud in clouds]
+        lifted = torch.relu(self.lift(torch.cat([point_inputs(cloud) for cloud in clouds])))
+        neighbours = _stacked([cloud.neighbours for cloud in clouds], [len(cloud) for cloud in clouds])
+        edges = torch.cat([edge_features(cloud.points, cloud.normals, cloud.neighbours) for cloud in clouds])
+        fine = torch.cat([lifted, self.stage(lifted, neighbours, edges)], dim=1)
+
+        sizes = [len(patches) for patches in all_patches]
+        member_of = _stacked([patches.member_of for patches in all_patches], sizes)
+        neighbours = _stacked([patches.neighbours for patches in all_patches], sizes)
+        edges = torch.cat([edge_features(p.points, p.normals, p.neighbours) for p in all_patches])
+        x = torch.relu(self.widen(pool(fine, member_of, sum(sizes))))
         depths = [x]
-        for stage in self.stages:
+        for stage in self.wide_stages:
             x = stage(x, neighbours, edges)
             depths.append(x)
-        stacked = self.merge(torch.cat(depths, dim=1))
-        return [CloudFeatures(points, self.context(points.amax(dim=0))) for points in stacked.split(sizes)]
+        merged = self.merge_wide(torch.cat(depths, dim=1))
+        points = torch.relu(self.merge_points(fine) + merged.index_select(0, member_of))
+        return [
+            CloudFeatures(of_points, patches, wide, self.context(wide.amax(dim=0)))
+            for of_points, patches, wide in zip(
+                points.split([len(cloud) for cloud in clouds]), all_patches, x.split(sizes), strict=True
+            )
+        ]
 
     def score(
         self, features: CloudFeatures, cloud: PreparedCloud, candidates: Candidates, mirror: Tensor | None = None
@@ -144,53 +240,19 @@ class TesNet(nn.Module):
         """
         poses = candidates.Ts_canonical_grasp
         sign = torch.ones(len(poses), device=poses.device) if mirror is None else mirror
-        index, inside, totals = self.regions(cloud, poses)
-        geometry = _region_inputs(cloud, poses, index, sign)
-        per_point = self.region_point(features.points)
-        gathered = per_point.index_select(0, index.flatten()).view(*index.shape, per_point.shape[1])
-        hidden = self.region_geometry(geometry) + gathered
-        hidden = self.region_mlp(hidden).masked_fill(~inside[..., None], 0)
-        closing, around = hidden.split([self.config.closing_points, self.config.around_points], dim=1)
+        closing, num_closing = self.closing(features.points, cloud, poses, sign)
+        around, num_around = self.around(features.wide, features.patches, poses, sign)
+        totals = torch.stack([num_closing, num_around], dim=1)
         joined = (
-            self.pooled(torch.cat([closing.amax(dim=1), around.amax(dim=1)], dim=1))
+            self.pooled(torch.cat([closing, around], dim=1))
             + self.approach(features.points)[candidates.approach]
             + self.contact(features.points)[candidates.contact]
             + self.candidate(_candidate_inputs(cloud, candidates, totals, sign))
             + self.situation(features.context)
+            + self.hidden_space(_probe_inputs(cloud, poses, sign))
         )
         logits: Tensor = self.head(joined)[:, 0]
         return logits
-
-    def regions(self, cloud: PreparedCloud, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-        """The points that each candidate looks at, first where the fingers close, then around the hand.
-
-        Returns:
-            Indices (C, M) into the cloud, a mask (C, M) of the ones that count, and how many points lie in either
-            region, (C, 2). Where more lie there than are looked at, a fixed pseudo-random choice of them is taken.
-        """
-        config = self.config
-        shuffled = torch.randperm(len(cloud), generator=torch.Generator().manual_seed(0)).to(poses.device)
-        x, y, z = points_in_grasp_frames(cloud.points[shuffled], poses)
-        x, y = x.abs_(), y.abs_()
-        found = []
-        for count, (breadth, length, behind, ahead) in (
-            (config.closing_points, config.closing_region),
-            (config.around_points, config.around_region),
-        ):
-            within = (x < breadth) & (y < length) & (z > -behind) & (z < ahead)
-            found.append(_first_members(within, shuffled, count))
-        index, inside, total = zip(*found, strict=True)
-        return torch.cat(index, dim=1), torch.cat(inside, dim=1), torch.stack(total, dim=1)
-
-
-def _first_members(within: Tensor, points: Tensor, count: int) -> tuple[Tensor, Tensor, Tensor]:
-    """The first `count` of `points` (P,) that each row of a mask (C, P) admits: indices, mask, totals (C,)."""
-    rank = within.cumsum(dim=1, dtype=torch.int32)
-    total = rank[:, -1]
-    row, column = (within & (rank <= count)).nonzero(as_tuple=True)
-    index = torch.zeros(len(within), count, dtype=torch.long, device=within.device)
-    index[row, (rank[row, column] - 1).long()] = points[column]
-    return index, torch.arange(count, device=within.device) < total[:, None], total
 
 
 def point_inputs(cloud: PreparedCloud) -> Tensor:
@@ -207,31 +269,24 @@ def point_inputs(cloud: PreparedCloud) -> Tensor:
     return torch.cat([10 * cloud.spectrum[:, :1], cloud.spectrum[:, 1:], facing, upright, height], dim=1)
 
 
-def edge_inputs(cloud: PreparedCloud) -> Tensor:
+def _stacked(tables: Sequence[Tensor], sizes: Sequence[int]) -> Tensor:
+    """Tables of indices one below the other, each raised by the sizes of those before it."""
+    before = itertools.accumulate(sizes, initial=0)
+    return torch.cat([table + start for table, start in zip(tables, before, strict=False)])
+
+
+def edge_features(points: Tensor, normals: Tensor, neighbours: Tensor) -> Tensor:
     """(P, k, 4) point-pair features: distance, cosines of both normals with the offset and with each other."""
-    shape = cloud.neighbours.shape
-    flat = cloud.neighbours.flatten()
-    offset = cloud.points.index_select(0, flat).view(*shape, 3) - cloud.points[:, None]
-    other = cloud.normals.index_select(0, flat).view(*shape, 3)
+    shape = neighbours.shape
+    flat = neighbours.flatten()
+    offset = points.index_select(0, flat).view(*shape, 3) - points[:, None]
+    other = normals.index_select(0, flat).view(*shape, 3)
     distance = offset.norm(dim=2)
     direction = offset / distance.clamp(min=1e-6)[..., None]
-    own = cloud.normals[:, None]
+    own = normals[:, None]
     return torch.stack(
         [distance / _LENGTH, (own * direction).sum(2), (other * direction).sum(2), (own * other).sum(2)], dim=2
     )
-
-
-def _region_inputs(cloud: PreparedCloud, poses: Tensor, index: Tensor, sign: Tensor) -> Tensor:
-    """(C, M, 7): position and normal of the region's points in the grasp frame, and their facing to the camera."""
-    shape = index.shape
-    flat = index.flatten()
-    rotation = poses[:, :3, :3]
-    local = (cloud.points.index_select(0, flat).view(*shape, 3) - poses[:, None, :3, 3]) @ rotation / _LENGTH
-    normal = cloud.normals.index_select(0, flat).view(*shape, 3) @ rotation
-    facing = (cloud.normals * cloud.view_directions).sum(dim=1).index_select(0, flat).view(*shape, 1)
-    flip = torch.ones(len(poses), 1, 3, device=poses.device)
-    flip[:, 0, 0] = sign
-    return torch.cat([local * flip, normal * flip, facing], dim=2)
 
 
 def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tensor, sign: Tensor) -> Tensor:
@@ -252,3 +307,31 @@ def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tens
             height[:, 0] = (poses[:, :3, 3] @ cloud.up - cloud.support_height) / (5 * _LENGTH)
             height[:, 1] = 1
     return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height], 1)
+
+
+def _probes() -> Tensor:
+    """(S, 3) places on and around the open hand, in the grasp frame, where it matters what the camera did not see."""
+    tip, root = PANDA.tip_offset, PANDA.palm_front
+    half = PANDA.max_width / 2
+    fingers = [
+        (x, side * (half + across), z)
+        for x in (-0.009, 0.009)
+        for side in (-1, 1)
+        for z in (tip, -0.003, -0.014, -0.026, root)
+        for across in (0.001, 0.012, 0.024)
+    ]
+    between = [
+        (x, y, z) for x in (-0.008, 0.008) for y in (-0.03, -0.015, 0.0, 0.015, 0.03) for z in (tip, -0.01, -0.025)
+    ]
+    ahead = [(0.0, y, tip + 0.012) for y in (-0.05, -0.025, 0.0, 0.025, 0.05)]
+    palm = [(x, y, root - 0.01) for x in (-0.02, 0.02) for y in (-0.09, -0.045, 0.0, 0.045, 0.09)]
+    return torch.tensor(fingers + between + ahead + palm)
+
+
+def _probe_inputs(cloud: PreparedCloud, poses: Tensor, sign: Tensor) -> Tensor:
+    """(C, 2 S): how far the probes lie behind what the camera saw, on a coarse and on a fine scale."""
+    probes = _probes().to(poses.device)
+    mirrored = torch.stack([sign, torch.ones_like(sign), torch.ones_like(sign)], dim=1)[:, None] * probes
+    places = mirrored @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
+    behind = depth_behind(cloud, places) / _LENGTH
+    return torch.cat([behind.clamp(-2, 3), (4 * behind).clamp(-1, 1)], dim=1)

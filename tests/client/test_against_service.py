@@ -13,6 +13,8 @@ import numpy as np
 import pytest
 
 import client
+from client.images import png
+from tests import depth_scene
 from tests.client.conftest import Call
 from tests.client.test_cloud_file import ply
 
@@ -101,3 +103,69 @@ def test_the_command_prints_the_same_grasps(tmp_path: Path, service_url: str, bo
     with client.GraspClient(service_url) as opened:
         expected = opened.grasps(box_on_table, **QUERY).to_dict()
     assert json.loads(done.stdout)["grasps"] == expected["grasps"]
+
+
+def test_a_depth_image_with_a_mask_gives_grasps_on_the_object(call: Call, service_url: str) -> None:
+    view = depth_scene.box_on_table()
+    reply = call(
+        service_url,
+        "grasps_from_depth",
+        view.depth,
+        intrinsics=view.intrinsics,
+        mask=view.mask,
+        T_cloud_camera=view.T_cloud_camera,
+        depth_scale=0.0005,
+        up=(0, 0, 1),
+        support_height="auto",
+        gripper={"max_width": 0.075},
+        max_candidates=300,
+    )
+    assert len(reply) >= 1
+    assert set(reply.widths) == {0.075}
+    for points in (reply.approach_points, reply.contact_points):
+        assert (np.abs(points - [0, 0, depth_scene.SIZE[2] / 2]) <= depth_scene.SIZE / 2 + 0.003).all()
+    assert any("support_height auto" in note for note in reply.warnings)
+
+
+def test_many_indices_are_a_target_like_their_box(call: Call, service_url: str, box_on_table: Points) -> None:
+    on_box = np.flatnonzero(box_on_table[:, 2] > 0)
+    reply = call(service_url, "grasps", box_on_table, target={"indices": on_box}, **QUERY)
+    assert len(reply) >= 1
+    assert reply.counts.points == len(box_on_table)
+    assert (reply.contact_points[:, 2] > 0.002).all()
+
+
+def test_the_command_reads_a_depth_image(tmp_path: Path, service_url: str) -> None:
+    view = depth_scene.box_on_table()
+    depth, mask = tmp_path / "depth.png", tmp_path / "mask.png"
+    depth.write_bytes(png(view.counts))
+    mask.write_bytes(png(view.mask.astype(np.uint8)))
+    k = view.intrinsics
+    flags = [
+        "--intrinsics",
+        k.fx,
+        k.fy,
+        k.cx,
+        k.cy,
+        "--mask",
+        mask,
+        "--camera-pose",
+        *view.T_cloud_camera.matrix.ravel(),
+    ]
+    flags += [
+        "--up",
+        0,
+        0,
+        1,
+        "--support-height",
+        "auto",
+        "--max-candidates",
+        300,
+        "--gripper",
+        "max_width=0.07",
+        "--json",
+    ]
+    command = [sys.executable, "-m", "client", str(depth), "--url", service_url, *map(str, flags)]
+    done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
+    assert done.returncode == 0, done.stderr
+    assert {grasp["width"] for grasp in json.loads(done.stdout)["grasps"]} == {0.07}

@@ -81,6 +81,7 @@ def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict
     server.script = [answering(found)]
     flags = (
         "--top-k 7 --viewpoint 0.3 0 -0.6 --viewpoint 0 0 1 --up 0 0 1 --support-height -0.05 "
+        "--target-box 0 0 0 1 1 1 --gripper max_width=0.06 finger_depth=0.04 "
         "--workspace -1 -1 -1 1 1 1 --approach 0 0 -1 30 --min-score 0.5 --min-separation 0.02 20 "
         "--num-approach-points 16 --max-candidates 100 --unseen occupied --pregrasp-distance 0.1 "
         "--frame-convention graspnet --seed 4 --model tesnet --request-id r-9"
@@ -94,6 +95,8 @@ def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict
         viewpoint=[(0.3, 0, -0.6), (0, 0, 1)],
         up=(0, 0, 1),
         support_height=-0.05,
+        target=schemas.Target(box=schemas.Box(min=(0, 0, 0), max=(1, 1, 1))),
+        gripper=schemas.GripperSize(max_width=0.06, finger_depth=0.04),
         workspace=schemas.Box(min=(-1, -1, -1), max=(1, 1, 1)),
         approach=schemas.Approach(direction=(0, 0, -1), max_angle_deg=30),
         min_score=0.5,
@@ -125,6 +128,11 @@ def test_flags_left_out_stay_the_service_s_defaults(server: ScriptedServer, clou
         ["c.ply", "--up", "0", "0", "nan"],
         ["c.ply", "--support-height", "0"],
         ["c.ply", "--unseen", "maybe"],
+        ["c.ply", "--support-height", "low", "--up", "0", "0", "1"],
+        ["c.ply", "--gripper", "0.06"],
+        ["c.ply", "--gripper", "max_width=wide"],
+        ["c.ply", "--mask", "mask.png"],
+        ["absent.png", "--intrinsics", "1", "1", "0", "0"],
     ],
 )
 def test_wrong_usage_and_unreadable_files_exit_2_with_one_reason(

@@ -11,7 +11,7 @@ from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from client.errors import InvalidArgument
-from client.request import GraspOptions, checked_points, header_value, points_request
+from client.request import GraspOptions, GripperSize, Intrinsics, checked_points, header_value, points_request
 from service import schemas
 
 CLOUD = np.zeros((2, 3), dtype=np.float32)
@@ -20,12 +20,14 @@ EVERY_OPTION: dict[str, Any] = {
     "up": np.array([0, 0, 1.0]),
     "workspace": {"min": np.zeros(3), "max": (1, 1, 1)},
     "support_height": np.float64(0.05),
+    "target": {"indices": np.arange(2)},
     "approach": {"direction": [0, 0, -1], "max_angle_deg": 30.0},
     "max_grasps": np.int64(7),
     "min_score": 0.25,
     "min_separation": {"translation": 0.02, "rotation_deg": 20.0},
     "num_approach_points": 16,
     "max_candidates": 500,
+    "gripper": {"max_width": 0.06, "finger_depth": np.float32(0.04)},
     "unseen": "occupied",
     "pregrasp_distance": 0.1,
     "frame_convention": "graspnet",
@@ -72,11 +74,19 @@ def test_the_client_has_the_options_of_the_wire_and_no_other() -> None:
     assert set(GraspOptions.__annotations__) == set(schemas.GraspOptions.model_fields) == set(EVERY_OPTION)
 
 
+def test_grippers_and_cameras_have_the_names_of_the_wire() -> None:
+    assert set(GripperSize.__annotations__) == set(schemas.GripperSize.model_fields)
+    assert set(Intrinsics.__annotations__) == set(schemas.Intrinsics.model_fields)
+
+
 def test_every_option_reaches_the_wire_as_the_schema_reads_it() -> None:
     parsed = schemas.GraspOptions.model_validate_json(json.dumps(_query(EVERY_OPTION)))
     assert parsed.viewpoint == [(0.3, 0, 0.6), (0, 0, 1)]
     assert parsed.workspace == schemas.Box(min=(0, 0, 0), max=(1, 1, 1))
     assert parsed.support_height == 0.05
+    assert parsed.target is not None
+    assert parsed.target.indices == [0, 1]
+    assert parsed.gripper == schemas.GripperSize(max_width=0.06, finger_depth=float(np.float32(0.04)))
     assert parsed.max_grasps == 7
     assert parsed.frame_convention == "graspnet"
 

@@ -139,6 +139,18 @@ def test_other_refusals_are_not_tried_again(
     assert len(server.received) == 1
 
 
+@pytest.mark.parametrize("status", [500, 502])
+def test_a_proxy_that_lost_the_service_is_asked_again(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any], status: int
+) -> None:
+    lost = Answering(status, b"Internal Server Error", {"Content-Type": "text/plain"})
+    server.script = [lost, answering(found)]
+    assert len(call(server.url, "grasps", points, client=QUICK)) == 3
+    server.script = [lost]
+    with pytest.raises(client.ServiceUnreachable, match=f"status {status} without a problem document"):
+        call(server.url, "grasps", points, client=QUICK)
+
+
 @pytest.mark.parametrize("first", [b"", b"{"])
 def test_a_silent_service_is_a_timeout_and_not_tried_again(
     call: Call, server: ScriptedServer, points: Points, first: bytes

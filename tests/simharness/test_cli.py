@@ -258,6 +258,7 @@ def test_only_watching_needs_the_viewer() -> None:
         (["--noise-std", "nan"], "out of range"),
         (["--watch", "--watch-port", "70000"], "give 0 to 65535"),
         (["--seeds", "1", "1"], "named twice"),
+        (["--watch", "--ray", "auto"], "leave out --ray"),
         (["--seed", "0", "--seeds", "1"], "not allowed with"),
         (["--resume"], "--out"),
         (["--round", "3"], "unrecognized"),

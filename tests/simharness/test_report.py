@@ -15,7 +15,7 @@ from PIL import Image
 from simharness.errors import UsageError
 from simharness.folder import RunFolder
 from simharness.page import page
-from simharness.photographer import FAILURES, FIRST_ROUNDS, VIEWS, Photographer, attempts_to_show, picture_name
+from simharness.photographer import FAILURES, FIRST_ROUNDS, VIEWS, attempts_to_show, keep_only, picture_name
 from simharness.pictures import (
     PICTURE_SIZE,
     close_up,
@@ -170,11 +170,11 @@ def test_first_attempts_and_the_earliest_failures_are_shown(make_round: Any) -> 
     assert attempts_to_show(rounds, 1) == []
 
 
-def test_pictures_that_are_not_shown_are_removed(make_round: Any, make_settings: Any, tmp_path: Path) -> None:
+def test_pictures_that_are_not_shown_are_removed(make_round: Any, tmp_path: Path) -> None:
     kept, dropped = make_round(0, 0, ["success", "slip"]).attempts
     for attempt in (kept, dropped):
         (tmp_path / picture_name(attempt, "cloud")).write_bytes(b"")
-    Photographer(make_settings(), tmp_path).keep_only([kept])
+    keep_only(tmp_path, [kept])
     assert [path.name for path in tmp_path.iterdir()] == [picture_name(kept, "cloud")]
 
 

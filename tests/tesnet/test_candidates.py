@@ -81,7 +81,8 @@ def test_no_more_points_are_chosen_than_are_different() -> None:
 def test_pairs_are_those_of_a_double_loop_over_the_limits() -> None:
     points, normals = exact(ready().points), exact(ready().normals)
     approach = candidates.farthest_points(ready().points, 12, 5)
-    found = set(zip(*(index.tolist() for index in candidates.pairs_in_reach(ready(), approach, CONFIG)), strict=True))
+    pairs = candidates.pairs_in_reach(ready().points, ready().normals, approach, CONFIG)
+    found = set(zip(*(index.tolist() for index in pairs), strict=True))
     certain, possible = set(), set()
     for a in approach.tolist():
         d = points - points[a]
@@ -98,7 +99,7 @@ def test_pairs_are_those_of_a_double_loop_over_the_limits() -> None:
 def assert_within_limits(cloud_: cloud.PreparedCloud, found: Candidates) -> None:
     """Every limit of CONVENTIONS.md, in float64, by formulas of the test's own."""
     p_a, p_c = exact(cloud_.points[found.approach]), exact(cloud_.points[found.contact])
-    n_c = exact(cloud_.normals[found.contact])
+    n_c = exact(candidates.contact_normals(cloud_, CONFIG)[found.contact])
     Ts = exact(found.Ts_canonical_grasp)
     x, y, z, tcp = (Ts[:, :3, column] for column in range(4))
     d = p_c - p_a
@@ -202,7 +203,7 @@ def test_every_pair_is_a_candidate_or_counted_as_rejected() -> None:
     assert set(rejected) == {"support", "from_below", "approach", "target"}
     assert rejected.pop("target") == 0
     assert min(rejected.values()) > 0
-    assert none == dict.fromkeys(rejected, 0)
+    assert not any(none.values())
     assert len(found) + sum(rejected.values()) == len(pairs) < 20_000
 
 
@@ -256,3 +257,17 @@ def test_the_axes_of_one_pair_are_those_drawn_in_the_conventions() -> None:
     np.testing.assert_allclose(poses[0, :3, 0], [-1, 0, 0], atol=1e-7)
     np.testing.assert_allclose(poses[0, :3, 3], [0, 0, 0.1 - (0.02 - 0.0016)], atol=1e-7)
     assert math.isclose(CONFIG.max_pair_distance, 0.038)
+
+
+def test_hands_close_level_on_walls_that_are_nearly_upright_and_only_there() -> None:
+    cloud_ = ready()
+    assert cloud_.up is not None
+    levelled = candidates.contact_normals(cloud_, CONFIG)
+    tilt = torch.rad2deg(torch.asin((cloud_.normals @ cloud_.up).abs().clamp(max=1)))
+    nearly = tilt < CONFIG.levelled_within_deg
+    assert 0 < int(nearly.sum()) < len(cloud_)
+    assert (levelled[~nearly] == cloud_.normals[~nearly]).all()
+    torch.testing.assert_close(levelled[nearly] @ cloud_.up, torch.zeros(int(nearly.sum())), atol=1e-6, rtol=0)
+    turned = torch.rad2deg(torch.acos((levelled * cloud_.normals).sum(dim=1).clamp(-1, 1)))[nearly]
+    torch.testing.assert_close(turned, tilt[nearly], atol=0.1, rtol=0)
+    assert candidates.contact_normals(replace(cloud_, up=None), CONFIG) is cloud_.normals

@@ -41,3 +41,31 @@ def test_half_a_turn_about_z_maps_the_hand_onto_itself() -> None:
 def test_lengths_must_be_positive(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is 0"):
         Gripper(**{name: 0.0})
+
+
+def test_a_part_whose_size_is_given_is_straight_unless_its_end_is_given_too() -> None:
+    assert Gripper.like_panda({}) == PANDA
+    straight = Gripper.like_panda({"finger_thickness": 0.02, "palm_breadth": 0.05})
+    assert (straight.finger_tip_thickness, straight.palm_front_breadth) == (0.02, 0.05)
+    tapered = Gripper.like_panda({"finger_thickness": 0.02, "finger_tip_thickness": 0.01})
+    assert tapered.finger_tip_thickness == 0.01
+
+
+def test_a_taper_is_no_longer_than_its_part() -> None:
+    short = Gripper.like_panda({"finger_depth": 0.02, "palm_depth": 0.03})
+    assert short.finger_taper == pytest.approx(short.finger_length)
+    assert short.palm_taper == 0.03
+    assert short.corners(0.08)[:, 2].min() == pytest.approx(short.palm_front - 0.03)
+
+
+@pytest.mark.parametrize(
+    ("lengths", "words"),
+    [
+        ({"max_width": -1.0}, "max_width is -1.0"),
+        ({"finger_tip_thickness": 0.03}, r"finger_tip_thickness is 0\.03, more than finger_thickness"),
+        ({"finger_depth": 0.012}, "finger_depth is 0.012; it must exceed 0.0126"),
+    ],
+)
+def test_a_hand_that_cannot_be_is_refused(lengths: dict[str, float], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        Gripper.like_panda(lengths)

@@ -54,7 +54,7 @@ def test_for_a_prepared_cloud_scores_are_invariant_and_grasps_equivariant(
 ) -> None:
     motion = random_motion(np.random.default_rng(seed))
     query = tabletop_query(scene) if with_up else ask(tabletop(scene), viewpoints=CAMERA)
-    query = replace(query, max_candidates=200)
+    query = replace(query, max_candidates=20_000)  # none is left to chance
     still = prepared(query)
     moved = moved_cloud(still, motion)
     found, again = (candidates.generate(c, query, candidates.CandidateConfig())[0] for c in (still, moved))
@@ -63,9 +63,8 @@ def test_for_a_prepared_cloud_scores_are_invariant_and_grasps_equivariant(
     )
     pairs = list(zip(again.approach.tolist(), again.contact.tolist(), strict=True))
     rows = [(common[pair], row) for row, pair in enumerate(pairs) if pair in common]
-    # A pair on the limit of a rule may drop out, and with it change which of too many candidates are drawn.
-    if len(found) == len(again):
-        assert len(rows) >= 0.98 * len(found)
+    assert len(rows) >= 0.98 * len(found)  # a pair on the limit of a rule may drop out
+    rows = rows[:: max(1, len(rows) // 200)]
     first, second = (torch.tensor(column) for column in zip(*rows, strict=True))
     T_moved = motion.matrix @ found.Ts_canonical_grasp[first].double().numpy()
     np.testing.assert_allclose(again.Ts_canonical_grasp[second], T_moved, atol=POSE_TOLERANCE)

@@ -9,7 +9,7 @@ import torch
 
 from tesnet import candidates, cloud, networks
 from tesnet.candidates import Candidates
-from tesnet.networks.tesnet import CloudFeatures, edge_inputs, point_inputs
+from tesnet.networks.tesnet import CloudFeatures, edge_features, point_inputs
 from tests.tesnet.scenes import CAMERA, ask, fresh_network, prepared, tabletop, tabletop_query
 
 
@@ -58,30 +58,57 @@ def test_scores_follow_their_candidates_in_another_order() -> None:
     torch.testing.assert_close(score(found.select(order)), score(found)[order], atol=1e-5, rtol=0)
 
 
-def test_the_regions_hold_the_points_that_a_loop_finds_there() -> None:
+def test_a_region_holds_the_points_that_a_loop_finds_there() -> None:
     ready, found = example()
     network = fresh_network()
-    index, inside, totals = network.regions(ready, found.Ts_canonical_grasp)
-    config = network.config
-    assert index.shape == inside.shape == (len(found), config.closing_points + config.around_points)
-    points = ready.points.double().numpy()
-    parts = (
-        (config.closing_region, 0, config.closing_points),
-        (config.around_region, config.closing_points, config.around_points),
-    )
-    for row in range(0, len(found), 12):
-        T = found.Ts_canonical_grasp[row].double().numpy()
-        local = (points - T[:3, 3]) @ T[:3, :3]
-        for number, ((breadth, length, behind, ahead), begin, size) in enumerate(parts):
+    for region, points in ((network.closing, ready.points), (network.around, features().patches.points)):
+        index, totals = region.members(points, found.Ts_canonical_grasp)
+        assert index.shape == (len(found), region.count)
+        breadth, length, behind, ahead = region.box
+        for row in range(0, len(found), 12):
+            T = found.Ts_canonical_grasp[row].double().numpy()
+            local = (points.double().numpy() - T[:3, 3]) @ T[:3, :3]
             slack = np.min(
                 [breadth - abs(local[:, 0]), length - abs(local[:, 1]), local[:, 2] + behind, ahead - local[:, 2]],
                 axis=0,
             )
             certain, possible = (set(np.flatnonzero(slack > limit).tolist()) for limit in (1e-6, -1e-6))
-            chosen = index[row, begin : begin + size][inside[row, begin : begin + size]].tolist()
-            assert len(certain) <= int(totals[row, number]) <= len(possible)
-            assert len(chosen) == len(set(chosen)) == min(size, int(totals[row, number]))
+            count = min(region.count, int(totals[row]))
+            chosen = index[row, :count].tolist()
+            assert len(certain) <= int(totals[row]) <= len(possible)
+            assert len(chosen) == len(set(chosen)) == count
             assert set(chosen) <= possible
+            assert set(index[row, count:].tolist()) <= {chosen[0]}
+
+
+def test_a_region_pools_what_its_layers_make_of_points_in_the_grasp_frame() -> None:
+    """The layers as written, in a loop: position, normal and facing in the grasp frame, mirrored where asked for."""
+    ready, found = example()
+    region, encoded = fresh_network().closing, features().points
+    sign = torch.where(torch.arange(len(found)) % 2 == 0, 1.0, -1.0)
+    with torch.inference_mode():
+        pooled, totals = region(encoded, ready, found.Ts_canonical_grasp, sign)
+        index, _ = region.members(ready.points, found.Ts_canonical_grasp)
+        for row in range(0, len(found), 15):
+            chosen = index[row, : min(region.count, int(totals[row]))]
+            T = found.Ts_canonical_grasp[row]
+            mirror = torch.tensor([float(sign[row]), 1.0, 1.0])
+            position = (ready.points[chosen] - T[:3, 3]) @ T[:3, :3] * mirror / 0.02
+            normal = ready.normals[chosen] @ T[:3, :3] * mirror
+            facing = (ready.normals * ready.view_directions).sum(dim=1, keepdim=True)[chosen]
+            hidden = region.geometry(torch.cat([position, normal, facing], 1)) + region.features(encoded[chosen])
+            expected = torch.relu(region.update(torch.relu(hidden))).amax(dim=0)
+            torch.testing.assert_close(pooled[row], expected, atol=1e-4, rtol=1e-4)
+
+
+def test_an_empty_region_pools_to_nothing() -> None:
+    ready, found = example()
+    away = found.Ts_canonical_grasp.clone()
+    away[:, :3, 3] += 10
+    with torch.inference_mode():
+        pooled, totals = fresh_network().closing(features().points, ready, away, torch.ones(len(found)))
+    assert not totals.any()
+    assert not pooled.any()
 
 
 def test_a_mirrored_scene_scores_as_the_mirror_option_says() -> None:
@@ -94,7 +121,7 @@ def test_a_mirrored_scene_scores_as_the_mirror_option_says() -> None:
 
 def test_point_pair_features_are_distances_and_cosines() -> None:
     ready, _ = example()
-    edges = edge_inputs(ready)
+    edges = edge_features(ready.points, ready.normals, ready.neighbours)
     assert edges.shape == (len(ready), 16, 4)
     for point in range(0, len(ready), 300):
         other = int(ready.neighbours[point, 5])
@@ -117,7 +144,7 @@ def test_what_the_caller_does_not_know_is_zero(options: dict[str, Any], known: i
 def test_an_unknown_network_or_field_is_refused_with_the_valid_ones() -> None:
     with pytest.raises(ValueError, match="unknown network 'vgn'; valid: tesnet"):
         networks.build("vgn")
-    with pytest.raises(ValueError, match="unknown configuration depth of tesnet; valid: channels, stages"):
+    with pytest.raises(ValueError, match="unknown configuration depth of tesnet; valid: channels, wide_channels"):
         networks.build("tesnet", {"depth": 3})
 
 

@@ -9,7 +9,7 @@ import torch
 
 from tesnet import candidates
 from tests.tesnet.scenes import prepared, tabletop_query
-from training.labels import OUTCOMES, LabelledView, save_scene
+from training.views import OUTCOMES, LabelledView, pairs_of, save_scene
 
 
 def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) -> LabelledView:
@@ -30,7 +30,9 @@ def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) 
     outcomes[successes] = OUTCOMES.index("success")
     return LabelledView(
         cloud=ready,
-        candidates=found,
+        pairs=pairs_of(ready, found),
+        approach=found.approach,
+        contact=found.contact,
         outcomes=outcomes,
         collision_free=torch.ones(count, dtype=torch.bool),
         scene="packed",

@@ -6,7 +6,7 @@ import torch
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view
 from training.augment import augment, random_rotation
-from training.labels import LabelledView
+from training.views import LabelledView
 
 VIEW = labelled_view()
 

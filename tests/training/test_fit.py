@@ -17,7 +17,7 @@ from training import fit as fitting
 from training.__main__ import main
 from training.evaluate import evaluate
 from training.fit import PRESETS, Recipe, fit
-from training.labels import LabelsError
+from training.views import LabelsError
 
 RECIPE = Recipe(max_epochs=2, views_per_step=2, candidates_per_view=30)
 

@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 
 from training.generate import GenerateConfig, generate
-from training.labels import OUTCOMES, LabelsError, load_scene, scene_files
+from training.views import OUTCOMES, LabelsError, load_scene, scene_files
 
 pytestmark = pytest.mark.sim
 

@@ -7,7 +7,7 @@ import pytest
 import torch
 
 from tests.training.synthetic import labelled_view, write
-from training.labels import LabelsError, load_scene, load_views, save_scene, scene_files
+from training.views import LabelsError, load_scene, load_views, save_scene, scene_files
 
 
 def test_labels_round_trip(tmp_path: Path) -> None:

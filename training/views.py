@@ -32,17 +32,27 @@ class LabelledView:
 
     Args:
         cloud: in its canonical frame.
-        candidates: C pairs of the cloud, with the poses that were tried.
+        pairs: (C, 3, 3) approach point, contact point and closing direction of each candidate.
+        approach, contact: (C,) the points of the cloud nearest to those of the pairs: where the cloud was rendered
+            again, no point lies just there.
         outcomes: (C,) codes into `OUTCOMES`.
         collision_free: (C,) whether the observed cloud left the hand's way free: such candidates the service scores.
         scene: kind of the scene, `packed` or `pile`.
     """
 
     cloud: PreparedCloud
-    candidates: Candidates
+    pairs: torch.Tensor
+    approach: torch.Tensor
+    contact: torch.Tensor
     outcomes: torch.Tensor
     collision_free: torch.Tensor
     scene: str
+
+    @property
+    def candidates(self) -> Candidates:
+        """The candidates with the poses that were tried."""
+        tried = grasp_poses(self.pairs[:, 0], self.pairs[:, 1], torch.nn.functional.normalize(self.pairs[:, 2], dim=1))
+        return Candidates(self.approach, self.contact, tried)
 
     @property
     def success(self) -> torch.Tensor:
@@ -53,7 +63,7 @@ class LabelledView:
 def save_scene(
     path: Path, description: Mapping[str, Any], views: Sequence[LabelledView], counts: NDArray[np.int64]
 ) -> None:
-    """Writes one scene atomically: coordinates as float16 (0.06 mm at 0.1 m), indices as uint16, outcomes as bytes."""
+    """Writes one scene atomically: the cloud as float16 (0.06 mm at 0.1 m), indices as uint16, outcomes as bytes."""
     arrays: dict[str, NDArray[Any]] = {
         "description": np.frombuffer(json.dumps(description).encode(), dtype=np.uint8),
         "counts": counts,
@@ -70,10 +80,10 @@ def save_scene(
         arrays |= {
             f"{number}/frame": np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8),
             f"{number}/points": cloud.points.numpy().astype(np.float16),
-            f"{number}/normals": cloud.normals.numpy().astype(np.float16),
             f"{number}/neighbours": cloud.neighbours.numpy().astype(np.uint16),
-            f"{number}/approach": view.candidates.approach.numpy().astype(np.uint16),
-            f"{number}/contact": view.candidates.contact.numpy().astype(np.uint16),
+            f"{number}/approach": view.approach.numpy().astype(np.uint16),
+            f"{number}/contact": view.contact.numpy().astype(np.uint16),
+            f"{number}/pairs": view.pairs.numpy(),
             f"{number}/outcomes": view.outcomes.numpy().astype(np.uint8),
             f"{number}/collision_free": view.collision_free.numpy(),
         }
@@ -81,6 +91,12 @@ def save_scene(
     with temporary.open("wb") as file:
         np.savez(file, allow_pickle=False, **arrays)
     temporary.replace(path)
+
+
+def pairs_of(cloud: PreparedCloud, candidates: Candidates) -> torch.Tensor:
+    """(C, 3, 3) approach points, contact points and closing directions of a cloud's own candidates."""
+    closing = candidates.Ts_canonical_grasp[:, :3, 1]
+    return torch.stack([cloud.points[candidates.approach], cloud.points[candidates.contact], closing], dim=1)
 
 
 def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
@@ -110,9 +126,7 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     points = tensor("points", torch.float32)
     neighbours = tensor("neighbours", torch.long)
     viewpoints = torch.tensor(frame["viewpoints"])
-    approach, contact = tensor("approach", torch.long), tensor("contact", torch.long)
-    tried = torch.nn.functional.normalize(tensor("normals", torch.float32), dim=1)[contact]
-    # Labels belong to the poses that were tried; what the network is shown is prepared as the service does it today.
+    # What the network is shown is prepared as the service does it today.
     config = PreparationConfig()
     normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
     normals, view_directions = orient_normals(points, normals, viewpoints)
@@ -129,7 +143,9 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     )
     return LabelledView(
         cloud=cloud,
-        candidates=Candidates(approach, contact, grasp_poses(points[approach], points[contact], tried)),
+        pairs=tensor("pairs", torch.float32),
+        approach=tensor("approach", torch.long),
+        contact=tensor("contact", torch.long),
         outcomes=tensor("outcomes", torch.uint8),
         collision_free=tensor("collision_free", torch.bool),
         scene=frame["scene"],

@@ -1,0 +1,324 @@
+"""The service as a Ray Serve application: replicas of the same FastAPI app behind Serve's proxy.
+
+`python -m service.deploy.ray` starts it and stays until SIGTERM; `application` is what `serve run` and Serve's
+configuration files name. Settings are the `GRASP_*` variables of the process that builds the application; every
+replica gets the same.
+"""
+
+from __future__ import annotations
+
+import argparse
+import logging
+import os
+import signal
+import sys
+import time
+from collections.abc import AsyncIterator, Iterator, Mapping
+from concurrent.futures import Future
+from contextlib import asynccontextmanager, contextmanager, suppress
+from types import FrameType
+from typing import TYPE_CHECKING, Any
+
+import anyio.to_thread
+import httpx
+from pydantic import ValidationError
+from starlette.datastructures import MutableHeaders
+from starlette.types import ASGIApp, Message, Receive, Scope, Send
+
+from service.logs import configure_logging
+from service.settings import InvalidSetting, Replicas, Settings, load_settings, service_version
+
+if TYPE_CHECKING:
+    from fastapi import FastAPI
+    from ray.serve import Application
+
+log = logging.getLogger("service")
+
+LOCAL = "local"
+"""The address of a cluster that is started for the command, on this machine alone, and ends with it."""
+
+NAME = "grasps"
+"""Of the application and its one deployment."""
+
+READY_WITHIN_S = 300.0
+
+LOGS = "/tmp/ray/session_latest/logs/serve"  # noqa: S108 - where Ray writes them
+
+TRIES_TO_START = 3
+"""Starts of a replica that fail, for instance over missing weights, before the application counts as failed."""
+
+KEEP_ALIVE_SECONDS = 65
+"""As `python -m service` has it."""
+
+SPARE_REQUESTS = 16
+"""Requests beyond its queue that a replica is given: those it computes, refuses, or answers about its health."""
+
+
+def application(replicas: Replicas) -> Application:
+    """The application for `serve.run`; a replica takes requests when its network is loaded and warm.
+
+    A full replica answers 429 itself, as everywhere. Serve's own limits lie just beyond, for the moments in which there
+    is no replica to ask: its answer is 503 with `Retry-After`.
+
+    Raises:
+        InvalidSetting: a `GRASP_*` variable cannot be used.
+    """
+    from ray import serve  # noqa: PLC0415 - takes seconds to load, which `--help` need not wait for
+
+    settings = replica_settings(os.environ, replicas)
+
+    def build() -> FastAPI:
+        return replica_app(settings)
+
+    requests = settings.queue_size + SPARE_REQUESTS
+    number: dict[str, Any] = {"num_replicas": replicas.min_replicas}
+    if replicas.max_replicas > replicas.min_replicas:
+        scaling = replicas.model_dump(include={"min_replicas", "max_replicas", "target_ongoing_requests"})
+        number = {"autoscaling_config": scaling}
+    deploy = serve.deployment(
+        name=NAME,
+        max_ongoing_requests=requests,
+        max_queued_requests=requests,
+        backpressure_config={"status_code": 503, "retry_after_s": 1},
+        graceful_shutdown_timeout_s=settings.drain_timeout,
+        max_constructor_retry_count=TRIES_TO_START,
+        ray_actor_options={"num_cpus": replicas.cpus, "num_gpus": replicas.gpus},
+        **number,
+    )
+    return deploy(serve.ingress(build)()).bind()
+
+
+def replica_settings(environment: Mapping[str, str], replicas: Replicas) -> Settings:
+    """The settings, where unset fitted to a replica's share of its machine: its cores, and a GPU only if it has one.
+
+    Raises:
+        InvalidSetting: a `GRASP_*` variable cannot be used.
+    """
+    settings = load_settings(environment)
+    fitted: dict[str, Any] = {}
+    if "num_threads" not in settings.model_fields_set:
+        fitted["num_threads"] = max(1, int(replicas.cpus))
+    if settings.device == "auto" and not replicas.gpus:
+        fitted["device"] = "cpu"
+    return settings.model_copy(update=fitted)
+
+
+def replica_app(settings: Settings) -> FastAPI:
+    """The service's app, whose start waits for the network: Serve sends requests to a replica that has started."""
+    from service.app import create_app  # noqa: PLC0415 - needed in replicas only
+    from service.loading import predictor_factory  # noqa: PLC0415 - the same
+
+    configure_logging(settings.log_level)
+    loaded: Future[None] = Future()
+    app = create_app(
+        settings, predictor_factory(settings), on_ready=lambda: loaded.set_result(None), on_failure=loaded.set_exception
+    )
+    app.add_middleware(_IdFromProxy)
+    lifespan = app.router.lifespan_context
+
+    @asynccontextmanager
+    async def lifespan_of_replica(app: FastAPI) -> AsyncIterator[Any]:
+        async with lifespan(app) as state:
+            await anyio.to_thread.run_sync(loaded.result)
+            yield state
+
+    app.router.lifespan_context = lifespan_of_replica
+    return app
+
+
+class _IdFromProxy:
+    """Leaves `X-Request-ID` to Serve's proxy, which adds the request's to every answer: twice would be a list.
+
+    Args:
+        app: the application inside.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+
+        async def sending(message: Message) -> None:
+            if message["type"] == "http.response.start":
+                del MutableHeaders(scope=message)["X-Request-ID"]
+            await send(message)
+
+        await self._app(scope, receive, sending)
+
+
+def main() -> int:
+    """Serve until SIGTERM or SIGINT, then finish what was accepted; the process's exit code.
+
+    0: ended as asked. 1: the application did not start. 2: a setting or the command line is wrong.
+    """
+    options = vars(_parser().parse_args())
+    address = options.pop("address")
+    try:
+        replicas = replicas_from(options)
+        settings = load_settings(os.environ)
+        configure_logging(settings.log_level)
+        with _cluster(address):
+            _end_on_signals()
+            if address == LOCAL:
+                check_room(replicas)
+            return _serve(settings, replicas, own_cluster=address == LOCAL)
+    except InvalidSetting as error:
+        return _fail(str(error), 2)
+
+
+def replicas_from(options: Mapping[str, Any]) -> Replicas:
+    """The replicas that the command line asks for.
+
+    Raises:
+        InvalidSetting: an option is out of range.
+    """
+    given = {name: value for name, value in options.items() if value is not None}
+    if "max_replicas" not in given and "min_replicas" in given:
+        given["max_replicas"] = given["min_replicas"]
+    try:
+        return Replicas.model_validate(given)
+    except ValidationError as error:
+        first = error.errors(include_url=False)[0]
+        if not first["loc"]:
+            raise InvalidSetting("--max-replicas", first["msg"].removeprefix("Value error, ")) from None
+        field = str(first["loc"][0])
+        remedy = Replicas.model_fields[field].description
+        raise InvalidSetting(_option(field), f"is {first['input']}; expected: {remedy}") from None
+
+
+def check_room(replicas: Replicas) -> None:
+    """Whether the cluster, which will not grow, has room for the replicas that are always there.
+
+    Raises:
+        InvalidSetting: they would wait for ever.
+    """
+    import ray  # noqa: PLC0415 - the cluster is there now
+
+    there = ray.cluster_resources()
+    for resource, share in (("CPU", replicas.cpus), ("GPU", replicas.gpus)):
+        needed, present = replicas.min_replicas * share, there.get(resource, 0.0)
+        if needed > present:
+            raise InvalidSetting(
+                "--min-replicas",
+                f"is {replicas.min_replicas} of {share:g} {resource} each, {needed:g} in all, and this machine has "
+                f"{present:g}; give fewer, lower --{resource.lower()}s, or the --address of a larger cluster",
+            )
+
+
+def _serve(settings: Settings, replicas: Replicas, *, own_cluster: bool) -> int:
+    import ray  # noqa: PLC0415 - the cluster is there now
+    from ray import serve  # noqa: PLC0415 - the same
+
+    url = f"http://{settings.host}:{settings.port}"
+    try:
+        # Serve waits a minute for its proxy and no longer, while on a busy machine all is well and merely slow.
+        with suppress(TimeoutError):
+            serve.start(
+                proxy_location="EveryNode",
+                http_options={"host": settings.host, "port": settings.port, "keep_alive_timeout_s": KEEP_ALIVE_SECONDS},
+            )
+        try:
+            with suppress(TimeoutError):
+                serve.run(application(replicas), name=NAME)
+            _await_ready(url)
+            fields = {"url": url, "ray": ray.get_runtime_context().gcs_address, "pid": os.getpid()}
+            log.info("ready", extra={"fields": {**fields, **replicas.model_dump()}})
+            signal.pause()
+        finally:
+            serve.delete(NAME)
+    except KeyboardInterrupt:
+        log.info("stopped")
+    except (RuntimeError, TimeoutError) as error:
+        return _fail(str(error), 1)
+    finally:
+        if own_cluster:
+            serve.shutdown()
+    return 0
+
+
+def _await_ready(url: str) -> None:
+    """Returns when the proxy answers for a replica.
+
+    Raises:
+        TimeoutError: it does not.
+    """
+    deadline = time.monotonic() + READY_WITHIN_S
+    with httpx.Client(base_url=url, timeout=10.0, trust_env=False) as http:
+        while time.monotonic() < deadline:
+            with suppress(httpx.TransportError):
+                if http.get("/health/ready").status_code == httpx.codes.OK:
+                    return
+            time.sleep(0.1)
+    raise TimeoutError(f"{url} was not ready after {READY_WITHIN_S:.0f} s; Serve's logs are in {LOGS}")
+
+
+@contextmanager
+def _cluster(address: str) -> Iterator[None]:
+    """Connected to a Ray cluster; one that is started here listens on the loopback interface alone.
+
+    Raises:
+        InvalidSetting: there is no cluster at the address.
+    """
+    os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
+    if address == LOCAL:
+        os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # to Ray this means: one machine, 127.0.0.1
+        # A proxy that is slow to start on a busy machine is replaced after three of these, and never gets there.
+        os.environ.setdefault("RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S", "60")
+    import ray  # noqa: PLC0415 - reads the environment when it is loaded
+
+    try:
+        ray.init(address=address, include_dashboard=False if address == LOCAL else None)
+    except (ConnectionError, ValueError) as error:
+        raise InvalidSetting("--address", f"is {address!r}, where no cluster answers: {error}") from error
+    try:
+        yield
+    finally:
+        ray.shutdown()
+
+
+def _end_on_signals() -> None:
+    """The first SIGTERM or SIGINT ends the command in order, the second at once. To call after `ray.init`."""
+
+    def at_once(number: int, _: FrameType | None) -> None:
+        os._exit(128 + number)
+
+    def in_order(_number: int, _: FrameType | None) -> None:
+        for number in (signal.SIGTERM, signal.SIGINT):
+            signal.signal(number, at_once)
+        raise KeyboardInterrupt
+
+    for number in (signal.SIGTERM, signal.SIGINT):
+        signal.signal(number, in_order)
+
+
+def _fail(message: str, code: int) -> int:
+    sys.stdout.flush()
+    print(f"python -m service.deploy.ray: {message}", file=sys.stderr)
+    return code
+
+
+def _option(field: str) -> str:
+    return f"--{field.replace('_', '-')}"
+
+
+def _parser() -> argparse.ArgumentParser:
+    parser = argparse.ArgumentParser(
+        prog="python -m service.deploy.ray",
+        description="The grasp service as replicas on Ray Serve. Settings are the GRASP_* variables that "
+        "`python -m service --help` lists; every replica gets the same.",
+        epilog="SIGTERM finishes accepted requests and exits with 0.",
+    )
+    for name, field in Replicas.model_fields.items():
+        default = "" if name == "max_replicas" else f" Default: {field.default}."
+        kind = int if field.annotation is int else float
+        parser.add_argument(_option(name), type=kind, metavar="N", help=f"{field.description}{default}")
+    parser.add_argument(
+        "--address", default=LOCAL, help=f"a running Ray cluster, or `{LOCAL}` for one of this machine (default)"
+    )
+    parser.add_argument("--version", action="version", version=f"tes-net {service_version()}")
+    return parser
+
+
+if __name__ == "__main__":
+    sys.exit(main())

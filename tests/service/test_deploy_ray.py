@@ -1,0 +1,83 @@
+"""Options, settings and app of a Ray Serve replica; no cluster here, see tests/test_ray_cluster.py."""
+
+from __future__ import annotations
+
+import asyncio
+import subprocess
+import sys
+from pathlib import Path
+
+import httpx
+import pytest
+
+from service.deploy.ray import replica_app, replica_settings, replicas_from
+from service.settings import InvalidSetting, Replicas, Settings
+from tesnet.errors import TesnetError
+
+
+def test_one_number_of_replicas_is_a_fixed_one() -> None:
+    replicas = replicas_from({"min_replicas": 3, "max_replicas": None})
+    assert (replicas.min_replicas, replicas.max_replicas) == (3, 3)
+    assert replicas_from({}) == Replicas()
+
+
+@pytest.mark.parametrize(
+    ("options", "words"),
+    [
+        ({"min_replicas": 0}, "--min-replicas is 0; expected: .* 1 to 1000"),
+        ({"min_replicas": 4, "max_replicas": 2}, "--max-replicas is 2, less than --min-replicas, 4"),
+        ({"cpus": 0.0}, "--cpus is 0.0; expected: .* more than 0"),
+        ({"gpus": -1.0}, "--gpus is -1.0"),
+        ({"gpus": 1.5}, "--gpus is 1.5; expected: .* or a whole number"),
+        ({"target_ongoing_requests": float("nan")}, "--target-ongoing-requests is nan"),
+    ],
+)
+def test_an_option_that_cannot_be_used_is_named_with_its_remedy(options: dict[str, float], words: str) -> None:
+    with pytest.raises(InvalidSetting, match=words):
+        replicas_from(options)
+
+
+def test_a_replica_uses_its_share_of_the_machine_unless_it_is_told_otherwise() -> None:
+    settings = replica_settings({}, Replicas(cpus=2.5))
+    assert (settings.num_threads, settings.device) == (2, "cpu")
+    assert replica_settings({}, Replicas(cpus=0.5)).num_threads == 1
+    assert replica_settings({}, Replicas(gpus=0.25)).device == "auto"
+    told = replica_settings({"GRASP_NUM_THREADS": "3", "GRASP_DEVICE": "cuda:1"}, Replicas())
+    assert (told.num_threads, told.device) == (3, "cuda:1")
+
+
+def test_a_replica_has_started_when_its_network_is_warm() -> None:
+    async def go() -> tuple[int, list[str]]:
+        app = replica_app(Settings(device="cpu", num_threads=1))
+        transport = httpx.ASGITransport(app)
+        async with (
+            app.router.lifespan_context(app),
+            httpx.AsyncClient(transport=transport, base_url="http://r") as http,
+        ):
+            answer = await http.get("/health/ready")
+            return answer.status_code, answer.headers.get_list("X-Request-ID")
+
+    # Serve's proxy adds the id itself.
+    assert asyncio.run(go()) == (200, [])
+
+
+def test_a_replica_without_weights_does_not_start(tmp_path: Path) -> None:
+    async def go() -> None:
+        app = replica_app(Settings(device="cpu", weights=tmp_path / "none.safetensors"))
+        async with app.router.lifespan_context(app):
+            raise AssertionError("started")
+
+    with pytest.raises(TesnetError, match=r"none\.safetensors"):
+        asyncio.run(go())
+
+
+def test_the_command_says_what_it_cannot_use_before_it_starts_a_cluster() -> None:
+    command = [sys.executable, "-m", "service.deploy.ray"]
+    helped = subprocess.run([*command, "--help"], capture_output=True, text=True, timeout=60, check=True)
+    for option in ("--min-replicas", "--max-replicas", "--target-ongoing-requests", "--cpus", "--gpus", "--address"):
+        assert option in helped.stdout
+    for arguments, words in ((["--cpus", "0"], "--cpus is 0.0"), (["--address", "nowhere"], "--address is 'nowhere'")):
+        ended = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120, check=False)
+        assert ended.returncode == 2
+        assert words in ended.stderr
+        assert "Traceback" not in ended.stderr

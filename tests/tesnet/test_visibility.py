@@ -1,0 +1,41 @@
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import torch
+
+from tesnet.cloud import PreparedCloud
+from tesnet.visibility import depth_behind
+from tests.tesnet.scenes import ask, prepared
+
+
+def wall() -> PreparedCloud:
+    """A square wall of 0.2 m at z = 0, seen from 0.5 m above its middle."""
+    grid = np.linspace(-0.1, 0.1, 101)
+    x, y = np.meshgrid(grid, grid)
+    points = np.stack([x, y, np.zeros_like(x)], axis=-1).reshape(-1, 3)
+    return prepared(ask(points, viewpoints=[[0.0, 0.0, 0.5]], up=[0.0, 0.0, 1.0]))
+
+
+def places(cloud: PreparedCloud, positions: list[list[float]]) -> torch.Tensor:
+    return torch.tensor(cloud.T_cloud_canonical.inverse().apply(np.array(positions)), dtype=torch.float32)
+
+
+def test_depth_is_measured_from_the_surface_in_the_line_of_sight() -> None:
+    cloud = wall()
+    behind, before, beside = depth_behind(
+        cloud, places(cloud, [[0, 0, -0.03], [0.01, 0, 0.04], [0.2, 0, -0.03]])
+    ).tolist()
+    assert abs(behind - 0.03) < 0.002
+    assert abs(before + 0.04) < 0.002
+    assert beside == -np.inf
+
+
+def test_a_place_that_one_of_two_viewpoints_sees_is_not_hidden() -> None:
+    cloud = wall()
+    hidden = places(cloud, [[0.0, 0.0, -0.05]])
+    assert float(depth_behind(cloud, hidden)) > 0.04
+    from_below = places(cloud, [[0.0, 0.0, -0.5]])
+    both = replace(cloud, viewpoints=torch.cat([cloud.viewpoints, from_below]))
+    assert float(depth_behind(both, hidden)) < -0.04

@@ -1,0 +1,175 @@
+"""What runs on Ray, on one real cluster of this machine: replicas of the service, rounds, scenes."""
+
+from __future__ import annotations
+
+import json
+import os
+import signal
+import socket
+import subprocess
+import sys
+import threading
+import uuid
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import httpx
+import numpy as np
+import pytest
+
+from client import GraspClient, RetryPolicy
+from tests.conftest import ServiceProcess, running_service
+
+ROOT = Path(__file__).resolve().parents[1]
+TIMES = {"timings_ms", "latency", "latency_ms", "this_run"}
+REPLICA = b"ray::ServeReplica"
+CLIENTS = 3
+REQUESTS = 4
+"""Of each client, once a replica was killed."""
+
+pytestmark = [pytest.mark.slow, pytest.mark.sim]
+
+
+class OnRay(ServiceProcess):
+    """Ray puts lines of its own between those of the command."""
+
+    def parse(self, text: str) -> dict[str, Any] | None:
+        return super().parse(text) if text.startswith("{") else None
+
+
+@pytest.fixture(scope="module")
+def settings_of_ray() -> dict[str, str]:
+    """A cluster of our own that tells nobody of itself, and keeps the replicas' output out of ours."""
+    return {
+        "RAY_AUTH_TOKEN": uuid.uuid4().hex,
+        "RAY_LOG_TO_DRIVER": "0",
+        "RAY_USAGE_STATS_ENABLED": "0",
+        "GRASP_NUM_THREADS": "1",
+    }
+
+
+@pytest.fixture(scope="module")
+def served(settings_of_ray: dict[str, str]) -> Iterator[ServiceProcess]:
+    """Two replicas on a local cluster; `ray` in its line `ready` is the cluster's address."""
+    port = str(_free_port())
+    command = [sys.executable, "-m", "service.deploy.ray", "--min-replicas", "2", "--cpus", "0.1"]
+    with running_service(command, {**settings_of_ray, "GRASP_PORT": port}, OnRay) as service:
+        service.wait_for("ready")
+        yield service
+
+
+def _free_port() -> int:
+    with socket.socket() as probe:
+        probe.bind(("127.0.0.1", 0))
+        return int(probe.getsockname()[1])
+
+
+def ready(served: ServiceProcess) -> dict[str, Any]:
+    return next(line for line in served.lines if line["event"] == "ready")
+
+
+def run(module: str, *arguments: object, environment: dict[str, str]) -> None:
+    done = subprocess.run(
+        [sys.executable, "-m", module, *map(str, arguments)],
+        cwd=ROOT,
+        env={**os.environ, **environment},
+        capture_output=True,
+        text=True,
+        timeout=600,
+        check=False,
+    )
+    assert done.returncode == 0, done.stderr
+
+
+def without_times(value: Any) -> Any:
+    if isinstance(value, dict):
+        return {key: without_times(item) for key, item in value.items() if key not in TIMES}
+    return [without_times(item) for item in value] if isinstance(value, list) else value
+
+
+def lines(path: Path) -> Any:
+    return without_times([json.loads(line) for line in path.read_text().splitlines()])
+
+
+def test_rounds_end_the_same_on_a_cluster_where_every_worker_has_a_service(
+    served: ServiceProcess, settings_of_ray: dict[str, str], tmp_path: Path
+) -> None:
+    run("simharness", "--rounds", 2, "--workers", 1, "--out", tmp_path / "here", environment=settings_of_ray)
+    there = ["--rounds", 2, "--workers", 2, "--ray", ready(served)["ray"], "--out", tmp_path / "there"]
+    run("simharness", *there, environment=settings_of_ray)
+    for name in ("attempts.jsonl", "rounds.jsonl"):
+        assert lines(tmp_path / "there" / name) == lines(tmp_path / "here" / name)
+    pictures = [
+        {path.name: path.read_bytes() for path in (tmp_path / side / "pictures").iterdir()}
+        for side in ("here", "there")
+    ]
+    assert pictures[0] == pictures[1] != {}
+
+
+def test_scenes_are_labelled_the_same_on_a_cluster(
+    served: ServiceProcess, settings_of_ray: dict[str, str], tmp_path: Path
+) -> None:
+    asked = ["generate", "--scene", "packed", "--objects", "procedural-train", "--labels", 1, "--views", 1]
+    asked += ["--labels-per-view", 6, "--workers", 1, "--seed", 5]
+    run("training", *asked, "--out", tmp_path / "here", environment=settings_of_ray)
+    run("training", *asked, "--ray", ready(served)["ray"], "--out", tmp_path / "there", environment=settings_of_ray)
+    names = [sorted(path.name for path in (tmp_path / side).iterdir()) for side in ("here", "there")]
+    assert names[0] == names[1]
+    assert sum(name.endswith(".npz") for name in names[0]) == 2
+    for name in names[0]:
+        here, there = tmp_path / "here" / name, tmp_path / "there" / name
+        if name.endswith(".npz"):
+            with np.load(here, allow_pickle=False) as one, np.load(there, allow_pickle=False) as other:
+                assert {key: one[key].tobytes() for key in one} == {key: other[key].tobytes() for key in other}
+        else:
+            assert without_times(json.loads(here.read_text())) == without_times(json.loads(there.read_text()))
+
+
+def test_a_killed_replica_loses_no_request_and_sigterm_ends_in_order(served: ServiceProcess) -> None:
+    points = np.load(ROOT / "examples" / "clutter.npy", allow_pickle=False)[::8]
+    replies: list[int] = []
+    errors: list[Exception] = []
+    killed = threading.Event()
+
+    def ask() -> None:
+        after = 0
+        try:
+            with GraspClient(ready(served)["url"], timeout=300, retry=RetryPolicy(max_retries=5)) as client:
+                while after < REQUESTS:
+                    after += killed.is_set()
+                    reply = client.grasps(points, viewpoint=(0.38, 0.55, 0.48), up=(0, 0, 1))
+                    replies.append(len(reply.grasps))
+        except Exception as error:  # noqa: BLE001 - whatever it is, the test fails of it
+            errors.append(error)
+
+    threads = [threading.Thread(target=ask) for _ in range(CLIENTS)]
+    for thread in threads:
+        thread.start()
+    before = replicas(served.process.pid)
+    assert len(before) == 2
+    while len(replies) < CLIENTS and not errors:
+        threads[0].join(0.05)
+    os.kill(before[0], signal.SIGKILL)
+    killed.set()
+    for thread in threads:
+        thread.join(300)
+    assert errors == []
+    assert len(replies) >= CLIENTS * REQUESTS
+    assert set(replies) == {10}
+    assert httpx.get(ready(served)["url"] + "/health/ready").status_code == 200
+
+    served.process.terminate()
+    assert served.process.wait(120) == 0
+    served.wait_for("stopped")
+
+
+def replicas(parent: int) -> list[int]:
+    """Process ids of the replicas among the descendants of a process."""
+    found = []
+    for task in Path(f"/proc/{parent}/task").iterdir():
+        for child in map(int, (task / "children").read_text().split()):
+            if Path(f"/proc/{child}/cmdline").read_bytes().startswith(REPLICA):
+                found.append(child)
+            found += replicas(child)
+    return found

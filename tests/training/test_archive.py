@@ -1,0 +1,72 @@
+from __future__ import annotations
+
+from pathlib import Path
+
+import numpy as np
+import pytest
+
+from training.__main__ import main
+from training.archive import pack, unpack
+from training.generate import GenerateConfig, generate
+from training.views import LabelsError, load_scene, scene_files
+
+pytestmark = pytest.mark.sim
+
+
+@pytest.fixture(scope="module")
+def labels(tmp_path_factory: pytest.TempPathFactory) -> Path:
+    folder = tmp_path_factory.mktemp("labels")
+    config = GenerateConfig("packed", "procedural-train", seed=5, labels_per_view=16, colliding_share=0.5)
+    generate(config, labels=40, workers=1, out=folder)
+    return folder
+
+
+def test_an_archive_renders_the_views_and_labels_that_went_in(labels: Path, tmp_path: Path) -> None:
+    account = pack([labels], tmp_path / "archive")
+    assert unpack(tmp_path / "archive", "procedural-train", tmp_path / "again") == {"scenes": account["scenes"]}
+    kept = 0
+    for before, after in zip(scene_files([labels]), scene_files([tmp_path / "again"]), strict=True):
+        old, new = load_scene(before), load_scene(after)
+        assert [item["name"] for item in old[0]["objects"]] == [item["name"] for item in new[0]["objects"]]
+        for one, other in zip(old[1], new[1], strict=True):
+            kept += len(other.outcomes)
+            assert len(other.outcomes) >= 0.9 * len(one.outcomes)
+            np.testing.assert_allclose(
+                one.cloud.T_cloud_canonical.apply(one.cloud.points.numpy().mean(axis=0)),
+                other.cloud.T_cloud_canonical.apply(other.cloud.points.numpy().mean(axis=0)),
+                atol=3e-3,  # the noise is another
+            )
+            poses = [v.cloud.T_cloud_canonical.matrix @ v.candidates.Ts_canonical_grasp.numpy() for v in (one, other)]
+            for pose, outcome, free in zip(poses[1], other.outcomes, other.collision_free, strict=True):
+                same = np.abs(poses[0] - pose).max(axis=(1, 2)) < 2e-2  # 0.02 mm over a depth of 3 mm is half a degree
+                assert (int(outcome), bool(free)) in set(
+                    zip(one.outcomes[same].tolist(), one.collision_free[same].tolist(), strict=True)
+                )
+    assert 0.95 * account["labels"] <= kept <= account["labels"]
+
+
+def test_rendering_goes_on_where_it_stopped(labels: Path, tmp_path: Path) -> None:
+    pack([labels], tmp_path / "archive")
+    unpack(tmp_path / "archive", "procedural-train", tmp_path / "again")
+    first, *others = scene_files([tmp_path / "again"])
+    contents = first.read_bytes()
+    for path in others:
+        path.unlink()
+    unpack(tmp_path / "archive", "procedural-train", tmp_path / "again")
+    assert len(scene_files([tmp_path / "again"])) == 1 + len(others)
+    assert first.read_bytes() == contents
+
+
+def test_an_archive_without_its_objects_is_refused(
+    labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    pack([labels], tmp_path / "archive")
+    with pytest.raises(LabelsError, match="lacks procedural/train/"):
+        unpack(tmp_path / "archive", "procedural", tmp_path / "again")
+    arguments = ["fit", "--data", str(tmp_path / "archive"), "--validation", str(labels), "--out", str(tmp_path / "w")]
+    assert main(arguments) == 2
+    assert "name its objects with --objects" in capsys.readouterr().err
+    with pytest.raises(LabelsError, match="already holds"):
+        pack([labels], tmp_path / "archive")
+    with pytest.raises(LabelsError, match="holds no labels_"):
+        unpack(labels, "procedural-train", tmp_path / "again")

@@ -1,0 +1,293 @@
+"""Labels in a form small enough to ship: scenes, cameras, pairs and outcomes; the clouds are rendered again from it.
+
+A part of an archive is one `labels_*.npz`. Its arrays hold all scenes one after the other: what belongs to a view or
+a scene is found by counts. Positions are kept to 0.02 mm, in the world.
+"""
+
+from __future__ import annotations
+
+import json
+import multiprocessing
+import os
+from collections.abc import Iterator, Mapping, Sequence
+from dataclasses import dataclass
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import torch
+from numpy.typing import NDArray
+from tqdm import tqdm
+
+from simharness.camera import PRESET_NOISE, Preset, observe_from
+from simharness.objects import ObjectModel, load_object_set
+from simharness.scene import restore_scene
+from simharness.world import World
+from tesnet import cloud
+from tesnet.cloud import nearest_neighbours
+from tesnet.geometry import Pose
+from training.generate import observed_query
+from training.views import OUTCOMES, LabelledView, LabelsError, load_scene, save_scene, scene_files
+
+RESOLUTION = 2e-5
+"""Metres to which positions are kept."""
+
+LARGEST_SHIFT = 0.006
+"""Candidates whose points have no point of the new cloud within so many metres are left out."""
+
+_SCENES_PER_PART = 1000
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class ArchivedView:
+    """What is kept of a view: C candidates.
+
+    Args:
+        Ts_world_camera: (V, 4, 4).
+        pairs: (C, 3, 3) approach point, contact point and closing direction, in the world.
+        outcomes, collision_free: as in `LabelledView`.
+    """
+
+    Ts_world_camera: NDArray[np.float64]
+    pairs: NDArray[np.float64]
+    outcomes: NDArray[np.uint8]
+    collision_free: NDArray[np.bool_]
+
+
+def is_archive(folder: Path) -> bool:
+    """Whether the folder holds an archive."""
+    return any(folder.glob("labels_*.npz"))
+
+
+def pack(folders: Sequence[Path], out: Path) -> dict[str, Any]:
+    """Writes the labelled scenes under the folders to `out` as an archive; what is in it."""
+    out.mkdir(parents=True, exist_ok=True)
+    if stale := sorted(out.glob("labels_*.npz")):
+        raise LabelsError(f"{out} already holds {stale[0].name}; remove it, or choose another folder")
+    files = scene_files(folders)
+    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+    for part, first in enumerate(range(0, len(files), _SCENES_PER_PART)):
+        scenes = [_read_scene(path) for path in files[first : first + _SCENES_PER_PART]]
+        for _, views in scenes:
+            for view in views:
+                counts += np.bincount(view.outcomes, minlength=len(OUTCOMES))
+        _write_part(out / f"labels_{part:03d}.npz", scenes)
+    return {
+        "scenes": len(files),
+        "labels": int(counts.sum()),
+        "outcomes": dict(zip(OUTCOMES, counts.tolist(), strict=True)),
+        "bytes": sum(path.stat().st_size for path in out.glob("labels_*.npz")),
+    }
+
+
+def unpack(archive: Path, objects: str, out: Path, workers: int = 1) -> dict[str, Any]:
+    """Renders the scenes of an archive again, with noise of their own, as scene files in `out`.
+
+    Scenes already there are left alone, so that a stopped run goes on.
+
+    Args:
+        archive: folder of `labels_*.npz`.
+        objects: the object sets that the scenes were made of, joined with commas.
+        out: folder for the scene files.
+        workers: processes.
+
+    Raises:
+        LabelsError: no archive, or objects that the sets do not hold.
+    """
+    parts = sorted(archive.glob("labels_*.npz"))
+    if not parts:
+        raise LabelsError(f"{archive} holds no labels_*.npz; make one with `python -m training pack`")
+    out.mkdir(parents=True, exist_ok=True)
+    context = multiprocessing.get_context("spawn")
+    number = 0
+    with context.Pool(workers, _start_worker, (objects,)) as pool, tqdm(unit="scene") as progress:
+        for part in parts:
+            jobs = []
+            for description, views in _read_part(part):
+                path = out / f"scene_{number:07d}.npz"
+                number += 1
+                if not path.exists():
+                    jobs.append(pool.apply_async(_render_scene, (description, views, path)))
+            for job in jobs:
+                job.get()
+                progress.update()
+    return {"scenes": number}
+
+
+def _read_scene(path: Path) -> tuple[dict[str, Any], list[ArchivedView]]:
+    description, views = load_scene(path)
+    if len(description["cameras"]) != len(views):  # a view without candidates left no labels
+        description["cameras"] = _cameras_of(description, views)
+    archived = []
+    for cameras, view in zip(description["cameras"], views, strict=True):
+        to_world = view.cloud.T_cloud_canonical
+        pairs = view.pairs.double().numpy()
+        in_world = np.concatenate(
+            [
+                to_world.apply(pairs[:, :2].reshape(-1, 3)).reshape(-1, 2, 3),
+                to_world.rotate(pairs[:, 2])[:, None],
+            ],
+            axis=1,
+        )
+        archived.append(ArchivedView(np.array(cameras), in_world, view.outcomes.numpy(), view.collision_free.numpy()))
+    return description, archived
+
+
+def _cameras_of(description: Mapping[str, Any], views: Sequence[LabelledView]) -> list[Any]:
+    """The recorded cameras from which the views were taken."""
+    found = []
+    for view in views:
+        position = view.cloud.T_cloud_canonical.apply(view.cloud.viewpoints.double().numpy())[0]
+        distances = [np.linalg.norm(np.array(camera)[0, :3, 3] - position) for camera in description["cameras"]]
+        found.append(description["cameras"][int(np.argmin(distances))])
+    return found
+
+
+def _write_part(path: Path, scenes: Sequence[tuple[Mapping[str, Any], Sequence[ArchivedView]]]) -> None:
+    names = sorted({item["name"] for description, _ in scenes for item in description["objects"]})
+    columns: dict[str, list[NDArray[Any]]] = {}
+
+    def add(name: str, values: Any, dtype: Any) -> None:
+        columns.setdefault(name, []).append(np.asarray(values, dtype=dtype))
+
+    for description, views in scenes:
+        items = description["objects"]
+        add("scene_kind", [description["kind"] == "pile"], np.uint8)
+        add("scene_objects", [len(items)], np.uint8)
+        add("scene_views", [len(views)], np.uint8)
+        add("object_name", [names.index(item["name"]) for item in items], np.uint16)
+        add("object_scale", [item["scale"] for item in items], np.float32)
+        poses = [[*item["position"], *item["quaternion_xyzw"]] for item in items]
+        add("object_pose", np.array(poses).reshape(-1, 7), np.float32)
+        for view in views:
+            approach, which_approach = np.unique(_to_grid(view.pairs[:, 0]), axis=0, return_inverse=True)
+            closing = np.round(view.pairs[:, 2] * np.iinfo(np.int16).max).astype(np.int64)
+            contact, which_contact = np.unique(
+                np.hstack([_to_grid(view.pairs[:, 1]), closing]), axis=0, return_inverse=True
+            )
+            add("view_cameras", [len(view.Ts_world_camera)], np.uint8)
+            add("camera", view.Ts_world_camera[:, :3].reshape(-1, 12), np.float32)
+            add("view_approach_points", [len(approach)], np.uint16)
+            add("view_contact_points", [len(contact)], np.uint16)
+            add("view_labels", [len(view.outcomes)], np.uint16)
+            add("approach_point", approach, np.int16)
+            add("contact_point", contact[:, :3], np.int16)
+            add("closing_direction", contact[:, 3:], np.int16)
+            add("approach", which_approach.ravel(), np.uint16)
+            add("contact", which_contact.ravel(), np.uint16)
+            add("outcome", view.outcomes, np.uint8)
+            add("collision_free", view.collision_free, np.bool_)
+    arrays = {name: np.concatenate(values) for name, values in columns.items()}
+    # Neighbours in the table lie close to each other: bytes of equal weight side by side compress far better.
+    for name in ("approach_point", "contact_point", "closing_direction"):
+        arrays[name] = np.ascontiguousarray(arrays[name].T)
+    arrays["names"] = np.frombuffer(json.dumps(names).encode(), dtype=np.uint8)
+    temporary = path.with_name(f".{path.name}.{os.getpid()}")
+    with temporary.open("wb") as file:
+        np.savez_compressed(file, allow_pickle=False, **arrays)
+    temporary.replace(path)
+
+
+def _to_grid(points: NDArray[np.float64]) -> NDArray[np.int64]:
+    return np.round(points / RESOLUTION).astype(np.int64)
+
+
+def _read_part(path: Path) -> Iterator[tuple[dict[str, Any], list[ArchivedView]]]:
+    with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+        arrays = dict(stored)
+    names = json.loads(arrays.pop("names").tobytes())
+    for name in ("approach_point", "contact_point", "closing_direction"):
+        arrays[name] = arrays[name].T
+    position = dict.fromkeys(arrays, 0)
+
+    def take(name: str, count: int) -> NDArray[Any]:
+        begin = position[name]
+        position[name] += count
+        taken: NDArray[Any] = arrays[name][begin : begin + count]
+        return taken
+
+    for pile in arrays["scene_kind"]:
+        num_objects = int(take("scene_objects", 1)[0])
+        poses = take("object_pose", num_objects).astype(np.float64)
+        objects = [
+            {
+                "name": names[name],
+                "scale": float(scale),
+                "position": pose[:3].tolist(),
+                "quaternion_xyzw": pose[3:].tolist(),
+            }
+            for name, scale, pose in zip(
+                take("object_name", num_objects), take("object_scale", num_objects), poses, strict=True
+            )
+        ]
+        views = []
+        for _ in range(int(take("scene_views", 1)[0])):
+            cameras = np.tile(np.eye(4), (int(take("view_cameras", 1)[0]), 1, 1))
+            cameras[:, :3] = take("camera", len(cameras)).reshape(-1, 3, 4)
+            num_approach, num_contact, num_labels = (
+                int(take(f"view_{name}", 1)[0]) for name in ("approach_points", "contact_points", "labels")
+            )
+            approach = take("approach_point", num_approach) * RESOLUTION
+            contact = take("contact_point", num_contact) * RESOLUTION
+            closing = take("closing_direction", num_contact) / np.iinfo(np.int16).max
+            which_approach, which_contact = take("approach", num_labels), take("contact", num_labels)
+            pairs = np.stack([approach[which_approach], contact[which_contact], closing[which_contact]], axis=1)
+            views.append(ArchivedView(cameras, pairs, take("outcome", num_labels), take("collision_free", num_labels)))
+        kind = "pile" if pile else "packed"
+        yield {"kind": kind, "objects": objects}, views
+
+
+_models: dict[str, dict[str, ObjectModel]]
+
+
+def _start_worker(objects: str) -> None:
+    global _models  # noqa: PLW0603  a pool's initializer has no other way to hand state to its jobs
+    os.nice(10)
+    torch.set_num_threads(1)
+    _models = {
+        kind: {model.name: model for name in objects.split(",") for model in load_object_set(name, kind)}
+        for kind in ("packed", "pile")
+    }
+
+
+def _render_scene(description: dict[str, Any], views: Sequence[ArchivedView], path: Path) -> None:
+    models = _models[description["kind"]]
+    if missing := sorted({item["name"] for item in description["objects"]} - models.keys()):
+        raise LabelsError(f"--objects lacks {missing[0]}, which a scene of the archive holds; add its set")
+    rng = np.random.default_rng([len(views), *(len(view.outcomes) for view in views)])
+    rendered = []
+    with World() as world:
+        restore_scene(world, description, models)
+        for view in views:
+            labelled = _render_view(world, view, description["kind"], rng)
+            if labelled is not None:
+                rendered.append(labelled)
+    counts = sum(
+        (np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES)) for view in rendered),
+        np.zeros(len(OUTCOMES), dtype=np.int64),
+    )
+    cameras = [view.Ts_world_camera.tolist() for view in views]
+    save_scene(path, description | {"cameras": cameras}, rendered, counts)
+
+
+def _render_view(world: World, view: ArchivedView, kind: str, rng: np.random.Generator) -> LabelledView | None:
+    preset: Preset = "random" if len(view.Ts_world_camera) == 1 else "multi3"
+    cameras = [Pose.from_matrix(matrix) for matrix in view.Ts_world_camera]
+    observation = observe_from(world, cameras, rng, PRESET_NOISE[preset])
+    prepared = cloud.prepare(observed_query(observation), cloud.PreparationConfig(), torch.device("cpu"))
+    if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
+        return None
+    from_world = prepared.T_cloud_canonical.inverse()
+    points = from_world.apply(view.pairs[:, :2].reshape(-1, 3)).reshape(-1, 2, 3)
+    pairs = torch.tensor(np.concatenate([points, from_world.rotate(view.pairs[:, 2])[:, None]], axis=1)).float()
+    nearest = nearest_neighbours(prepared.points, 1, pairs[:, :2].reshape(-1, 3))[:, 0].view(-1, 2)
+    near = ((prepared.points[nearest] - pairs[:, :2]).norm(dim=2) < LARGEST_SHIFT).all(dim=1)
+    return LabelledView(
+        cloud=prepared,
+        pairs=pairs[near],
+        approach=nearest[near, 0],
+        contact=nearest[near, 1],
+        outcomes=torch.from_numpy(view.outcomes.copy())[near],
+        collision_free=torch.from_numpy(view.collision_free.copy())[near],
+        scene=kind,
+    )
