@@ -3,7 +3,7 @@
 #   make demo     clear a few tables through the service; leaves demo-report/report.html
 #   make test     run the tests                      make check    lint, types, walls between packages
 #   make serve    start the service on port 8000     make bench    speed tables
-#   make format   rewrite files in the one style
+#   make format   rewrite files in the one style     make audit    pinned versions against published advisories
 #
 # Variables:
 #   PYTHON=python3.11       interpreter for the environment (3.10 or 3.11: PyBullet has no wheels for later ones)
@@ -22,7 +22,7 @@ BIN := $(VENV)/bin
 INSTALLED := $(VENV)/.installed
 PIP_INSTALL := $(BIN)/python -m pip install --constraint constraints.txt
 
-.PHONY: demo test check format serve bench clean
+.PHONY: demo test check format serve bench audit clean
 .DELETE_ON_ERROR:
 
 demo: $(INSTALLED)
@@ -49,6 +49,9 @@ serve: $(INSTALLED)
 bench: $(INSTALLED)
 	$(BIN)/python -m bench.predict
 	$(BIN)/python -m bench.serve
+
+audit: $(INSTALLED)
+	.ci/audit $(BIN)/python
 
 # PyTorch comes first and alone: an index of CPU wheels must not answer for anything else, its dependencies included.
 $(INSTALLED): pyproject.toml constraints.txt

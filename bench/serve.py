@@ -27,14 +27,21 @@ PREDICTOR_STAGES = ("prepare", "candidates", "network", "rank")
 
 
 @contextmanager
-def running_service(port: int, threads: int) -> Iterator[subprocess.Popen[bytes]]:
-    """`python -m service` on the loopback interface for as long as the context lasts; its log goes to stderr."""
+def running_service(port: int, threads: int, **settings: str) -> Iterator[subprocess.Popen[bytes]]:
+    """`python -m service` on the loopback interface for as long as the context lasts.
+
+    Args:
+        port: where it listens.
+        threads: CPU threads of its predictor.
+        settings: more `GRASP_*` variables.
+    """
     environment = os.environ | {
         "GRASP_HOST": "127.0.0.1",
         "GRASP_PORT": str(port),
         "GRASP_DEVICE": "cpu",
         "GRASP_NUM_THREADS": str(threads),
         "GRASP_LOG_LEVEL": "warning",
+        **settings,
     }
     with subprocess.Popen([sys.executable, "-m", "service"], env=environment) as process:
         try:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import asyncio
 import logging
 import re
 import time
@@ -13,7 +14,7 @@ import anyio
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import problem_response
+from service.errors import NotReady, problem_response
 from service.metrics import Metrics
 
 log = logging.getLogger("service.request")
@@ -85,6 +86,8 @@ class RequestMiddleware:
 
         try:
             await self._app(scope, receiving, sending)
+        except asyncio.CancelledError:  # the server's: draining took too long
+            await _refuse_at_the_end(record, scope, receive, send)
         except Exception as error:
             log.exception("failed", extra={"fields": {"request_id": record.request_id}})
             if record.status:
@@ -123,6 +126,17 @@ def request_id_of(given: str | None) -> str:
 
 def _announces_body(headers: Headers) -> bool:
     return "transfer-encoding" in headers or headers.get("content-length", "0") != "0"
+
+
+async def _refuse_at_the_end(record: RequestRecord, scope: Scope, receive: Receive, send: Send) -> None:
+    """Answer 503, without waiting for the rest of a body, unless an answer was begun."""
+    if record.status:
+        return
+    error = NotReady("The service ended before this request was answered; repeat it.", retry_after=1)
+    response = problem_response(error, scope)
+    response.headers.update({"X-Request-ID": record.request_id, "Connection": "close"})
+    record.status = response.status_code
+    await response(scope, receive, send)
 
 
 async def _linger(receive: Receive, record: RequestRecord) -> None:

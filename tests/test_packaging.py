@@ -31,7 +31,7 @@ EXTRAS = {
     "service": ("service", "ray"),  # of which only service.deploy.ray needs Ray
     "simharness": ("sim", "ray"),  # of which only the option --ray needs Ray
     "training": ("service", "sim"),
-    "bench": ("service",),
+    "bench": ("service", "dev"),  # fuzzing needs what generates requests
 }
 
 

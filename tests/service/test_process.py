@@ -78,9 +78,11 @@ def test_a_second_sigterm_ends_at_once(start_service: StartService) -> None:
 def test_the_drain_timeout_ends_a_request_that_never_ends(start_service: StartService) -> None:
     with start_service(GRASP_DRAIN_TIMEOUT="0.2") as service:
         service.wait_for("ready")
-        with half_a_request(service.url):
+        with half_a_request(service.url) as connection:
             service.process.send_signal(signal.SIGINT)
+            assert connection.recv(4096).startswith(b"HTTP/1.1 503 ")
             assert service.process.wait(60) == 0
+        service.wait_for("request", status=503)
 
 
 def test_port_0_picks_a_free_port_and_the_log_tells_it(shared_service: Any) -> None:
