@@ -299,7 +299,7 @@ def _actors(task: Task[Job], count: int, address: str) -> Iterator[_Actors[Job]]
 
 
 def _check_listens(address: str) -> None:
-    """Whether anything listens at HOST:PORT, which Ray itself would try for minutes; other addresses are Ray's to judge.
+    """Whether anything listens at HOST:PORT, which Ray would try for minutes; other addresses are Ray's to judge.
 
     Raises:
         UsageError: nothing does.
