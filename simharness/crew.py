@@ -299,7 +299,7 @@ def _actors(task: Task[Job], count: int, address: str) -> Iterator[_Actors[Job]]
 
 
 def _check_listens(address: str) -> None:
-    """Whether anything listens at HOST:PORT, which Ray itself would try for minutes; other addresses are Ray's to judge.
+    """Whether anything listens at HOST:PORT, which Ray would try for minutes; other addresses are Ray's to judge.
 
     Raises:
         UsageError: nothing does.
@@ -309,7 +309,8 @@ def _check_listens(address: str) -> None:
         try:
             socket.create_connection((host, int(port)), timeout=_ANSWERS_WITHIN_S).close()
         except (OSError, OverflowError) as error:
-            raise UsageError(f"--ray {address}: no cluster answers ({error}); start one with `ray start`") from error
+            why = f"no cluster answers there ({error}); start one with `ray start`"
+            raise UsageError(f"--ray {address}: {why}") from error
 
 
 def _settings_of_the_service(environment: Mapping[str, str]) -> dict[str, str]:
