@@ -1,0 +1,90 @@
+"""The clients in examples/ really run, against a real server, and all say the same."""
+
+from __future__ import annotations
+
+import re
+import shutil
+import subprocess
+from collections.abc import Sequence
+from pathlib import Path
+
+import httpx
+import numpy as np
+import pytest
+
+from client import GraspClient
+
+ROOT = Path(__file__).resolve().parents[1]
+EXAMPLES = ROOT / "examples"
+CPP = EXAMPLES / "cpp" / "grasps.cpp"
+PACKAGES = "curl jq nodejs g++ libcurl4-openssl-dev nlohmann-json3-dev"
+REMEDY = f"the examples need these Debian packages: apt-get install {PACKAGES}"
+
+
+def run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
+    assert shutil.which(command[0]), f"{command[0]} is missing; {REMEDY}"
+    return subprocess.run(command, cwd=ROOT, capture_output=True, text=True, timeout=300, check=False)
+
+
+@pytest.fixture(scope="module")
+def cpp_program(tmp_path_factory: pytest.TempPathFactory) -> str:
+    """The C++ example, built by the command that it documents."""
+    (documented,) = re.findall(r"^//   (g\+\+ .*)$", CPP.read_text(encoding="utf-8"), re.MULTILINE)
+    program = str(tmp_path_factory.mktemp("cpp") / "grasps")
+    built = run([program if word == "grasps" else word for word in documented.split()])
+    assert built.returncode == 0, f"{built.stderr}\nWhere a header or library is missing: {REMEDY}"
+    assert built.stderr == ""
+    return program
+
+
+@pytest.fixture(params=["curl", "node", "cpp"])
+def example(request: pytest.FixtureRequest) -> list[str]:
+    """The command that starts an example, without its arguments."""
+    if request.param == "cpp":
+        return [request.getfixturevalue("cpp_program")]
+    if request.param == "node":
+        return ["node", str(EXAMPLES / "node.mjs")]
+    for program in ("curl", "jq"):
+        assert shutil.which(program), f"{program} is missing; {REMEDY}"
+    return [str(EXAMPLES / "curl.sh")]
+
+
+def test_an_example_prints_the_best_grasps(example: list[str], service_url: str) -> None:
+    with GraspClient(service_url) as client:
+        reply = client.grasps(
+            np.load(EXAMPLES / "clutter.npy"),
+            viewpoint=(0.38, 0.55, 0.48),
+            up=(0, 0, 1),
+            support_height=0.05,
+            max_grasps=5,
+        )
+    ended = run([*example, service_url])
+    assert ended.returncode == 0, ended.stderr
+    assert ended.stdout.splitlines() == [
+        f"{grasp.score:.2f}  TCP at {' '.join(f'{metres:.3f}' for metres in grasp.position)}"
+        f"  opening {grasp.width:.3f} m"
+        for grasp in reply.grasps
+    ]
+    assert len(reply.grasps) == 5
+
+
+def test_an_example_fails_with_the_detail_of_a_problem(example: list[str], service_url: str, tmp_path: Path) -> None:
+    points = np.full((10, 3), np.nan, np.float32)
+    detail = httpx.post(
+        f"{service_url}/grasps", content=points.tobytes(), headers={"Content-Type": "application/octet-stream"}
+    ).json()["detail"]
+    np.save(tmp_path / "bad.npy", points)
+    ended = run([*example, service_url, str(tmp_path / "bad.npy")])
+    assert (ended.returncode, ended.stdout, ended.stderr) == (1, "", f"422: {detail}\n")
+
+
+def test_an_example_says_where_nothing_was_found(example: list[str], service_url: str, tmp_path: Path) -> None:
+    np.save(tmp_path / "one.npy", np.ones((1, 3), np.float32))
+    ended = run([*example, service_url, str(tmp_path / "one.npy")])
+    assert (ended.returncode, ended.stdout) == (0, "no grasps: too_few_points\n")
+
+
+def test_continuous_integration_installs_what_the_examples_need() -> None:
+    script = (ROOT / ".ci" / "run").read_text(encoding="utf-8")
+    installed = set(re.findall(r"[\w+.-]+", script))
+    assert set(PACKAGES.split()) <= installed
