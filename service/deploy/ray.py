@@ -51,7 +51,7 @@ KEEP_ALIVE_SECONDS = 65
 """As `python -m service` has it."""
 
 SPARE_REQUESTS = 16
-"""Requests beyond its queue that a replica is given: those it computes, refuses, or answers about its health."""
+"""Requests that a replica is given beyond those that wait or are computed: those it decodes, refuses, or answers."""
 
 
 def application(replicas: Replicas) -> Application:
@@ -70,7 +70,7 @@ def application(replicas: Replicas) -> Application:
     def build() -> FastAPI:
         return replica_app(settings)
 
-    requests = settings.queue_size + SPARE_REQUESTS
+    requests = settings.queue_size + settings.max_batch + SPARE_REQUESTS
     number: dict[str, Any] = {"num_replicas": replicas.min_replicas}
     if replicas.max_replicas > replicas.min_replicas:
         scaling = replicas.model_dump(include={"min_replicas", "max_replicas", "target_ongoing_requests"})
