@@ -309,7 +309,8 @@ def _check_listens(address: str) -> None:
         try:
             socket.create_connection((host, int(port)), timeout=_ANSWERS_WITHIN_S).close()
         except (OSError, OverflowError) as error:
-            raise UsageError(f"--ray {address}: no cluster answers ({error}); start one with `ray start`") from error
+            why = f"no cluster answers there ({error}); start one with `ray start`"
+            raise UsageError(f"--ray {address}: {why}") from error
 
 
 def _settings_of_the_service(environment: Mapping[str, str]) -> dict[str, str]:

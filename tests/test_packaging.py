@@ -23,8 +23,9 @@ PROJECT = PYPROJECT["project"]
 OURS = {"tesnet", "service", "client", "simharness", "training", "weights", "bench", "tests"}
 # Where a distribution's name is not the name that is imported.
 MODULES = {"import-linter": "importlinter", "pillow": "PIL", "python-neo-lzf": "lzf"}
-# PyBullet's wheel brings the module of its data files; FastAPI's requests and responses are Starlette's.
-ALSO = {"pybullet": {"pybullet_data"}, "fastapi": {"starlette"}}
+# PyBullet's wheel brings the module of its data files; FastAPI's requests and responses are Starlette's;
+# uvicorn's HTTP is h11's.
+ALSO = {"pybullet": {"pybullet_data"}, "fastapi": {"starlette"}, "uvicorn": {"h11"}}
 EXTRAS = {
     "client": (),
     "tesnet": ("service",),

@@ -43,6 +43,7 @@ def settings_of_ray() -> dict[str, str]:
     """A cluster of our own that tells nobody of itself, and keeps the replicas' output out of ours."""
     return {
         "RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER": "0",  # to Ray this means: one machine, 127.0.0.1
+        "RAY_AUTH_MODE": "token",
         "RAY_AUTH_TOKEN": uuid.uuid4().hex,
         "RAY_LOG_TO_DRIVER": "0",
         "RAY_USAGE_STATS_ENABLED": "0",

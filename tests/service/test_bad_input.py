@@ -341,7 +341,7 @@ def test_a_client_that_sends_a_too_large_body_to_its_end_reads_the_413(http: htt
     problem_of(http.post("/grasps", content=body(), headers=OCTETS), 413, "67108864")
 
 
-@pytest.mark.parametrize("path", ["/", "/grasp", "/grasps/", "/health", "/v2/health/live"])
+@pytest.mark.parametrize("path", ["/", "/grasp", "/grasps/", "/health", "/v2/repository/index"])
 def test_another_path_is_a_404(http: httpx.Client, path: str) -> None:
     problem_of(http.get(path), 404, "/docs")
 
