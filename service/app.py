@@ -15,7 +15,7 @@ from starlette.middleware.cors import CORSMiddleware
 from service import schemas
 from service.access import AccessMiddleware
 from service.batching import PredictionWorker, PredictorFactory
-from service.errors import NotReady, ServiceError, problem_response
+from service.errors import NotReady, ServiceError, Unauthorized, problem_response
 from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
 from service.inference_protocol import inference_protocol
 from service.metrics import Metrics
@@ -109,11 +109,19 @@ def create_app(
         endpoint.check_ready()
         return schemas.Health(status="ready")
 
-    @app.get("/model", tags=["model"], summary="Networks, frames and limits", responses=problems(NotReady))
+    @app.get(
+        "/model", tags=["model"], summary="Networks, frames and limits", responses=problems(NotReady, Unauthorized)
+    )
     async def model() -> schemas.ModelResponse:
         return _describe(settings, worker)
 
-    @app.get("/metrics", tags=["health"], summary="Prometheus metrics", response_class=Response)
+    @app.get(
+        "/metrics",
+        tags=["health"],
+        summary="Prometheus metrics",
+        response_class=Response,
+        responses=problems(Unauthorized),
+    )
     async def metrics_text() -> Response:
         return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
 

@@ -156,7 +156,7 @@ def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: G
         endpoint: answers, with the same queue, deadlines and limits as `POST /grasps`.
     """
     router = APIRouter(prefix=INFERENCE_PROTOCOL, tags=["inference protocol"])
-    model_problems = problems(NotReady, UnknownModel)
+    model_problems = problems(NotReady, Unauthorized, UnknownModel)
 
     def check_path(model: str, version: str | None) -> None:
         loaded = worker.model
@@ -164,7 +164,7 @@ def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: G
             what = shortened(model if version is None else f"{model}, version {version}")
             raise UnknownModel(f"{what} is not loaded; loaded: {loaded.name}, version {loaded.version}.")
 
-    @router.get("", summary="Server metadata")
+    @router.get("", summary="Server metadata", responses=problems(Unauthorized))
     async def server() -> schemas.ServerMetadata:
         return schemas.ServerMetadata(name="tes-net", version=service_version(), extensions=["binary_tensor_data"])
 

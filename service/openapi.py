@@ -40,11 +40,22 @@ def document_grasps(app: FastAPI) -> None:
                 ref_template=REF,
             )
             document.setdefault("components", {}).setdefault("schemas", {}).update(models["$defs"])
+            _drop_validation_errors(document)
             document["paths"]["/grasps"]["post"].update(_grasps(models["$defs"]["GraspOptions"]["properties"]))
             app.openapi_schema = document
         return app.openapi_schema
 
     app.openapi = openapi  # type: ignore[method-assign]  # the way FastAPI's documentation gives for extending it
+
+
+def _drop_validation_errors(document: dict[str, Any]) -> None:
+    """FastAPI adds its own 422 to every route with a parameter in the path; any text is valid there."""
+    for model in ("HTTPValidationError", "ValidationError"):
+        document["components"]["schemas"].pop(model, None)
+    for operations in document["paths"].values():
+        for operation in operations.values():
+            if "HTTPValidationError" in str(operation["responses"].get("422")):
+                del operation["responses"]["422"]
 
 
 def _grasps(options: dict[str, Any]) -> dict[str, Any]:
