@@ -245,7 +245,7 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
     one is repeated.
 
     Points and queries are sorted along x, and a block of queries is compared with the slab of points around it only;
-    the few queries whose k-th neighbour may lie outside the slab are compared with all points.
+    the few queries whose k-th neighbour may lie outside the slab, and all queries of few points, are compared with all.
     """
     sources = points if queries is None else queries
     available = min(k, len(points))
@@ -255,8 +255,9 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
     sorted_points = exact[order]
     query_order = wanted[:, 0].argsort()
     neighbours = torch.empty(len(sources), available, dtype=torch.long, device=points.device)
-    unsure = []
-    for rows in query_order.split(_SLAB_QUERIES):
+    few = len(points) <= _FEW_POINTS
+    unsure = [query_order] if few else []
+    for rows in () if few else query_order.split(_SLAB_QUERIES):
         block = wanted[rows]
         ends = torch.stack([block[0, 0] - _SLAB_MARGIN, block[-1, 0] + _SLAB_MARGIN])
         first, last = torch.searchsorted(by_x, ends).tolist()
@@ -273,6 +274,7 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
     return neighbours if available == k else torch.cat([neighbours, neighbours[:, -1:].expand(-1, k - available)], 1)
 
 
+_FEW_POINTS = 700
 _SLAB_QUERIES = 192
 _SLAB_MARGIN = 0.02
 _LARGEST_TABLE = 4_000_000
