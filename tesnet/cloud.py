@@ -222,6 +222,15 @@ def _unit_or_none(vector: Tensor) -> Tensor | None:
     return None if float(length) < 1e-6 else vector / length
 
 
+def members_of_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
+    """Of integer cells (P, 3): the number (P,) of each row among the occupied cells, in order, and their sizes."""
+    cells = cells - cells.min(dim=0).values
+    extent = cells.max(dim=0).values + 1
+    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    _, member_of, counts = keys.unique(return_inverse=True, return_counts=True)
+    return member_of, counts
+
+
 def voxel_downsample(points: Tensor, voxel_size: float) -> Tensor:
     """The mean of the rows (N, 3 or more), which begin with x, y, z, in every occupied cell, in the order of the cells.
 
@@ -229,9 +238,7 @@ def voxel_downsample(points: Tensor, voxel_size: float) -> Tensor:
     """
     corner = points[:, :3].min(dim=0).values
     cells = ((points[:, :3] - corner) / voxel_size + 0.5).floor().long()
-    extent = cells.max(dim=0).values + 1
-    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    _, cell_of_point, counts = keys.unique(return_inverse=True, return_counts=True)
+    cell_of_point, counts = members_of_cells(cells)
     sums = torch.zeros(len(counts), points.shape[1], dtype=torch.float64, device=points.device)
     sums.index_add_(0, cell_of_point, points.double())
     means: Tensor = (sums / counts[:, None]).to(points.dtype)

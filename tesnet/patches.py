@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tesnet.cloud import PreparedCloud, nearest_neighbours, sight_axes
+from tesnet.cloud import PreparedCloud, members_of_cells, nearest_neighbours, sight_axes
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -53,11 +53,8 @@ def group(cloud: PreparedCloud, size: float) -> Patches:
     """
     axes = sight_axes(cloud.points, cloud.viewpoints[0])
     cells = ((cloud.points - cloud.points.mean(dim=0)) @ axes / size + 0.5).floor().long()
-    cells -= cells.min(dim=0).values
-    extent = cells.max(dim=0).values + 1
-    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    _, member_of, counts = keys.unique(return_inverse=True, return_counts=True)
-    sums = torch.zeros(len(counts), 9, device=keys.device)
+    member_of, counts = members_of_cells(cells)
+    sums = torch.zeros(len(counts), 9, device=cells.device)
     sums.index_add_(0, member_of, torch.cat([cloud.points, cloud.normals, cloud.view_directions], dim=1))
     points, normals, view_directions = (sums / counts[:, None]).split(3, dim=1)
     return Patches(

@@ -27,7 +27,7 @@ from tesnet import cloud
 from tesnet.cloud import nearest_neighbours
 from tesnet.geometry import Pose
 from training.generate import observed_query
-from training.views import OUTCOMES, LabelledView, LabelsError, load_scene, save_scene, scene_files
+from training.views import OUTCOMES, LabelledView, LabelsError, count_outcomes, load_scene, save_scene, scene_files
 
 RESOLUTION = 2e-5
 """Metres to which positions are kept."""
@@ -68,9 +68,7 @@ def pack(folders: Sequence[Path], out: Path) -> dict[str, Any]:
     counts = np.zeros(len(OUTCOMES), dtype=np.int64)
     for part, first in enumerate(range(0, len(files), _SCENES_PER_PART)):
         scenes = [_read_scene(path) for path in files[first : first + _SCENES_PER_PART]]
-        for _, views in scenes:
-            for view in views:
-                counts += np.bincount(view.outcomes, minlength=len(OUTCOMES))
+        counts += count_outcomes(view.outcomes for _, views in scenes for view in views)
         _write_part(out / f"labels_{part:03d}.npz", scenes)
     return {
         "scenes": len(files),
@@ -120,17 +118,14 @@ def _read_scene(path: Path) -> tuple[dict[str, Any], list[ArchivedView]]:
         description["cameras"] = _cameras_of(description, views)
     archived = []
     for cameras, view in zip(description["cameras"], views, strict=True):
-        to_world = view.cloud.T_cloud_canonical
-        pairs = view.pairs.double().numpy()
-        in_world = np.concatenate(
-            [
-                to_world.apply(pairs[:, :2].reshape(-1, 3)).reshape(-1, 2, 3),
-                to_world.rotate(pairs[:, 2])[:, None],
-            ],
-            axis=1,
-        )
+        in_world = _moved(view.cloud.T_cloud_canonical, view.pairs.double().numpy())
         archived.append(ArchivedView(np.array(cameras), in_world, view.outcomes.numpy(), view.collision_free.numpy()))
     return description, archived
+
+
+def _moved(T_b_a: Pose, pairs: NDArray[np.float64]) -> NDArray[np.float64]:
+    """Pairs (C, 3, 3), two points and a direction in frame a, in frame b."""
+    return np.concatenate([T_b_a.apply(pairs[:, :2]), T_b_a.rotate(pairs[:, 2:])], axis=1)
 
 
 def _cameras_of(description: Mapping[str, Any], views: Sequence[LabelledView]) -> list[Any]:
@@ -262,12 +257,8 @@ def _render_scene(description: dict[str, Any], views: Sequence[ArchivedView], pa
             labelled = _render_view(world, view, description["kind"], rng)
             if labelled is not None:
                 rendered.append(labelled)
-    counts = sum(
-        (np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES)) for view in rendered),
-        np.zeros(len(OUTCOMES), dtype=np.int64),
-    )
     cameras = [view.Ts_world_camera.tolist() for view in views]
-    save_scene(path, description | {"cameras": cameras}, rendered, counts)
+    save_scene(path, description | {"cameras": cameras}, rendered)
 
 
 def _render_view(world: World, view: ArchivedView, kind: str, rng: np.random.Generator) -> LabelledView | None:
@@ -277,9 +268,7 @@ def _render_view(world: World, view: ArchivedView, kind: str, rng: np.random.Gen
     prepared = cloud.prepare(observed_query(observation), cloud.PreparationConfig(), torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
-    from_world = prepared.T_cloud_canonical.inverse()
-    points = from_world.apply(view.pairs[:, :2].reshape(-1, 3)).reshape(-1, 2, 3)
-    pairs = torch.tensor(np.concatenate([points, from_world.rotate(view.pairs[:, 2])[:, None]], axis=1)).float()
+    pairs = torch.tensor(_moved(prepared.T_cloud_canonical.inverse(), view.pairs)).float()
     nearest = nearest_neighbours(prepared.points, 1, pairs[:, :2].reshape(-1, 3))[:, 0].view(-1, 2)
     near = ((prepared.points[nearest] - pairs[:, :2]).norm(dim=2) < LARGEST_SHIFT).all(dim=1)
     return LabelledView(

@@ -35,7 +35,7 @@ from tesnet.geometry import PANDA
 from tesnet.networks import Network
 from tesnet.predictor import APPROACH_DISTANCE
 from tesnet.query import GraspQuery
-from training.views import OUTCOMES, LabelledView, LabelsError, pairs_of, save_scene, scene_files
+from training.views import OUTCOMES, LabelledView, LabelsError, count_outcomes, pairs_of, save_scene, scene_files
 
 _HEAR_S = 1.0
 
@@ -183,12 +183,10 @@ class _Scenes:
         def make(number: int, _: Emit) -> _Made:
             started = time.monotonic()
             description, views = label_scene(self.config, sets, number, network)
-            counts = np.zeros(len(OUTCOMES), dtype=np.int64)
-            for view in views:
-                counts += np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES))
+            counts = count_outcomes(view.outcomes.numpy() for view in views)
             with TemporaryDirectory(prefix="scene-") as folder:
                 path = Path(folder) / _file_name(number)
-                save_scene(path, description, views, counts)
+                save_scene(path, description, views)
                 return _Made(path.read_bytes(), counts, time.monotonic() - started)
 
         yield make

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import os
 import zipfile
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from typing import Any
@@ -60,13 +60,19 @@ class LabelledView:
         return self.outcomes == 0
 
 
-def save_scene(
-    path: Path, description: Mapping[str, Any], views: Sequence[LabelledView], counts: NDArray[np.int64]
-) -> None:
+def count_outcomes(outcomes: Iterable[NDArray[np.uint8]]) -> NDArray[np.int64]:
+    """How often each of `OUTCOMES` stands in arrays of their codes."""
+    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+    for codes in outcomes:
+        counts += np.bincount(codes, minlength=len(OUTCOMES))
+    return counts
+
+
+def save_scene(path: Path, description: Mapping[str, Any], views: Sequence[LabelledView]) -> None:
     """Writes one scene atomically: the cloud as float16 (0.06 mm at 0.1 m), indices as uint16, outcomes as bytes."""
     arrays: dict[str, NDArray[Any]] = {
         "description": np.frombuffer(json.dumps(description).encode(), dtype=np.uint8),
-        "counts": counts,
+        "counts": count_outcomes(view.outcomes.numpy() for view in views),
     }
     for number, view in enumerate(views):
         cloud = view.cloud

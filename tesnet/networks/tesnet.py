@@ -140,8 +140,7 @@ class RegionPooling(nn.Module):
 
         Turning each candidate's weights is cheaper than turning all points in its box.
         """
-        mirror = torch.stack([sign, torch.ones_like(sign), torch.ones_like(sign)], dim=1)
-        rotation = poses[:, :3, :3] * mirror[:, None]
+        rotation = poses[:, :3, :3] * _mirror(sign)[:, None]
         points, normals, facing = self.geometry.weight.T.split([3, 3, 1])
         turned = rotation @ (points / _LENGTH)
         weight = torch.cat([turned, rotation @ normals, facing.expand(len(poses), -1, -1)], dim=1)
@@ -163,6 +162,8 @@ class RegionPooling(nn.Module):
 class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
+    probes: Tensor
+
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()
         self.config = config
@@ -180,8 +181,9 @@ class TesNet(nn.Module):
         self.contact = nn.Linear(f, config.head_channels[0], bias=False)
         self.pooled = nn.Linear(2 * config.region_channels[1], config.head_channels[0], bias=False)
         self.candidate = nn.Linear(_CANDIDATE_INPUTS, config.head_channels[0])
+        self.register_buffer("probes", _probes(), persistent=False)
         self.hidden_space = nn.Sequential(
-            nn.Linear(2 * len(_probes()), config.probe_channels),
+            nn.Linear(2 * len(self.probes), config.probe_channels),
             nn.ReLU(),
             nn.Linear(config.probe_channels, config.head_channels[0], bias=False),
         )
@@ -249,7 +251,7 @@ class TesNet(nn.Module):
             + self.contact(features.points)[candidates.contact]
             + self.candidate(_candidate_inputs(cloud, candidates, totals, sign))
             + self.situation(features.context)
-            + self.hidden_space(_probe_inputs(cloud, poses, sign))
+            + self.hidden_space(_probe_inputs(self.probes, cloud, poses, sign))
         )
         logits: Tensor = self.head(joined)[:, 0]
         return logits
@@ -293,8 +295,7 @@ def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tens
     """(C, 16): the pair, numbers of points near, n_a, line of sight and up, all in the grasp frame, and the height."""
     poses = candidates.Ts_canonical_grasp
     rotation = poses[:, :3, :3]
-    flip = torch.ones(len(poses), 3, device=poses.device)
-    flip[:, 0] = sign
+    flip = _mirror(sign)
     pair = ((cloud.points[candidates.contact] - cloud.points[candidates.approach])[:, None] @ rotation)[:, 0]
     normal = (cloud.normals[candidates.approach][:, None] @ rotation)[:, 0] * flip
     sight = (cloud.view_directions[candidates.approach][:, None] @ rotation)[:, 0] * flip
@@ -307,6 +308,11 @@ def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tens
             height[:, 0] = (poses[:, :3, 3] @ cloud.up - cloud.support_height) / (5 * _LENGTH)
             height[:, 1] = 1
     return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height], 1)
+
+
+def _mirror(sign: Tensor) -> Tensor:
+    """(C, 3) factors of x, y and z that mirror in the hand's plane where the sign (C,) is -1."""
+    return torch.stack([sign, torch.ones_like(sign), torch.ones_like(sign)], dim=1)
 
 
 def _probes() -> Tensor:
@@ -328,10 +334,8 @@ def _probes() -> Tensor:
     return torch.tensor(fingers + between + ahead + palm)
 
 
-def _probe_inputs(cloud: PreparedCloud, poses: Tensor, sign: Tensor) -> Tensor:
-    """(C, 2 S): how far the probes lie behind what the camera saw, on a coarse and on a fine scale."""
-    probes = _probes().to(poses.device)
-    mirrored = torch.stack([sign, torch.ones_like(sign), torch.ones_like(sign)], dim=1)[:, None] * probes
-    places = mirrored @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
+def _probe_inputs(probes: Tensor, cloud: PreparedCloud, poses: Tensor, sign: Tensor) -> Tensor:
+    """(C, 2 S): how far the probes (S, 3) lie behind what the camera saw, on a coarse and on a fine scale."""
+    places = (_mirror(sign)[:, None] * probes) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
     behind = depth_behind(cloud, places) / _LENGTH
     return torch.cat([behind.clamp(-2, 3), (4 * behind).clamp(-1, 1)], dim=1)

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from pathlib import Path
 
-import numpy as np
 import torch
 
 from tesnet import candidates
@@ -43,6 +42,5 @@ def write(folder: Path, views: list[LabelledView]) -> Path:
     """The views, one scene file each, in a folder."""
     folder.mkdir(parents=True, exist_ok=True)
     for number, view in enumerate(views):
-        counts = np.bincount(view.outcomes.numpy(), minlength=len(OUTCOMES)).astype(np.int64)
-        save_scene(folder / f"scene_{number:07d}.npz", {"number": number}, [view], counts)
+        save_scene(folder / f"scene_{number:07d}.npz", {"number": number}, [view])
     return folder

@@ -13,7 +13,7 @@ from training.views import LabelsError, load_scene, load_views, save_scene, scen
 def test_labels_round_trip(tmp_path: Path) -> None:
     first, second = labelled_view(0), labelled_view(1, count=40)
     path = tmp_path / "scene_0000000.npz"
-    save_scene(path, {"seed": 3, "objects": ["a", "b"]}, [first, second], np.array([20, 0, 40, 0, 0]))
+    save_scene(path, {"seed": 3, "objects": ["a", "b"]}, [first, second])
     description, views = load_scene(path)
     assert description == {"seed": 3, "objects": ["a", "b"]}
     assert len(views) == 2
@@ -43,14 +43,14 @@ def test_labels_round_trip(tmp_path: Path) -> None:
 
 
 def test_a_scene_without_views_round_trips(tmp_path: Path) -> None:
-    save_scene(tmp_path / "scene_0.npz", {"number": 0}, [], np.zeros(5, dtype=np.int64))
+    save_scene(tmp_path / "scene_0.npz", {"number": 0}, [])
     assert load_scene(tmp_path / "scene_0.npz") == ({"number": 0}, [])
 
 
 @pytest.mark.parametrize("damage", ["empty", "cut", "text", "other"])
 def test_a_damaged_file_is_refused(tmp_path: Path, damage: str) -> None:
     path = tmp_path / "scene_0.npz"
-    save_scene(path, {}, [labelled_view(count=30)], np.zeros(5, dtype=np.int64))
+    save_scene(path, {}, [labelled_view(count=30)])
     if damage == "other":
         np.savez(path, allow_pickle=False, a=np.zeros(3))
     else:
@@ -63,7 +63,7 @@ def test_scenes_are_read_in_order_from_every_folder(tmp_path: Path) -> None:
     view = labelled_view(count=30)
     for name in ("b/scene_0000001.npz", "b/scene_0000000.npz", "a/deep/scene_0000005.npz"):
         (tmp_path / name).parent.mkdir(parents=True, exist_ok=True)
-        save_scene(tmp_path / name, {}, [view], np.zeros(5, dtype=np.int64))
+        save_scene(tmp_path / name, {}, [view])
     files = scene_files([tmp_path / "b", tmp_path / "a"])
     assert [path.name for path in files] == ["scene_0000000.npz", "scene_0000001.npz", "scene_0000005.npz"]
     assert sum(1 for _ in load_views([tmp_path])) == 3
