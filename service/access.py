@@ -10,19 +10,18 @@ from starlette.datastructures import Headers
 from starlette.types import ASGIApp, Receive, Scope, Send
 
 from service.errors import Unauthorized, problem_response
+from service.viewer import PAGE_PATHS
 
-OPEN_PATHS = frozenset(
-    {
-        "/health/live",
-        "/health/ready",
-        "/v2/health/live",
-        "/v2/health/ready",
-        "/docs",
-        "/docs/oauth2-redirect",
-        "/openapi.json",
-    }
-)
-"""Answered without a key: what an orchestrator probes, and the documentation, which holds no secret."""
+OPEN_PATHS = PAGE_PATHS | {
+    "/health/live",
+    "/health/ready",
+    "/v2/health/live",
+    "/v2/health/ready",
+    "/docs",
+    "/docs/oauth2-redirect",
+    "/openapi.json",
+}
+"""Answered without a key: what an orchestrator probes, the documentation and the viewer, which hold no secret."""
 
 
 class AccessMiddleware:

@@ -23,6 +23,7 @@ from service.middleware import RequestMiddleware
 from service.openapi import document_grasps, problems
 from service.payloads import CONTENT_TYPES
 from service.settings import Settings, service_version
+from service.viewer import viewer
 from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
 from tesnet.geometry import FRAME_CONVENTIONS, HAND_TO_TCP, PANDA
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
@@ -126,6 +127,7 @@ def create_app(
         return Response(metrics.text(), media_type=CONTENT_TYPE_LATEST)
 
     app.include_router(inference_protocol(settings, worker, endpoint))
+    app.include_router(viewer(endpoint))
     document_grasps(app)
     return app
 

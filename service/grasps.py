@@ -7,8 +7,9 @@ from __future__ import annotations
 import asyncio
 import math
 import time
-from collections.abc import Callable, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
+from contextlib import contextmanager
 from dataclasses import dataclass
 from functools import partial
 from typing import TYPE_CHECKING, Any, TypeVar
@@ -30,7 +31,7 @@ from service.errors import (
 from service.intake import Intake
 from service.metrics import Metrics
 from service.middleware import RequestRecord
-from service.payloads import build_query, decoder_for, merged, parse_options, parse_query_string
+from service.payloads import OCTET_STREAM, build_query, decoder_for, merged, parse_options, parse_query_string
 from service.schemas import GraspOptions
 from service.settings import Settings
 from tesnet.query import GraspQuery
@@ -128,15 +129,32 @@ class GraspEndpoint:
         Raises:
             ServiceError, InvalidQuery: see the table in `service.errors`.
         """
+        with self._admitted(request) as deadline:
+            return await self._answer(request, request.state.record, reader_of(request), deadline)
+
+    async def answer_points(self, request: Request) -> Response:
+        """The points of a body of `POST /grasps` as little-endian float32 triples, admitted and limited like one.
+
+        Raises:
+            ServiceError, InvalidQuery: see the table in `service.errors`.
+        """
+        with self._admitted(request):
+            read = self.reader(request)
+            async with self._intake.body(request) as body:
+                asked = await self._in_thread(partial(read, body))
+            return Response(asked.query.points.astype("<f4").tobytes(), media_type=OCTET_STREAM)
+
+    @contextmanager
+    def _admitted(self, request: Request) -> Iterator[float]:
+        """The deadline of a request that is taken, within which the block ends."""
         self.check_ready()
         self._worker.check_room()
-        record: RequestRecord = request.state.record
         timeout = self._timeout(request)
-        deadline = record.arrived + timeout
+        deadline = request.state.record.arrived + timeout
         self._active += 1
         try:
             with anyio.fail_after(max(0.0, deadline - time.perf_counter())):
-                return await self._answer(request, record, reader_of(request), deadline)
+                yield deadline
         except TimeoutError:
             raise DeadlineExceeded(
                 f"No answer within {timeout:g} s; send fewer points, lower max_candidates, or set a larger "

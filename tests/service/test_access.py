@@ -13,6 +13,7 @@ import pytest
 from service.access import OPEN_PATHS
 from service.app import create_app
 from service.settings import load_settings
+from service.viewer import PAGE_PATHS
 
 Serve = Callable[..., Any]
 
@@ -58,7 +59,7 @@ def test_a_key_opens_and_nothing_else_does(guarded: str) -> None:
 
 def test_every_other_route_needs_a_key_too(guarded: str) -> None:
     app = create_app(load_settings({}), lambda: pytest.fail("is not started"))
-    pages = {"/docs", "/docs/oauth2-redirect", "/openapi.json"}
+    pages = {"/docs", "/docs/oauth2-redirect", "/openapi.json", "/viewer/points"} | PAGE_PATHS
     paths = pages | {re.sub(r"\{\w+\}", "tesnet", path) for path in app.openapi()["paths"]}
     assert paths >= OPEN_PATHS
     for path in paths:
