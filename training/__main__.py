@@ -109,7 +109,14 @@ def _add_unpack(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", required=True, help="the sets that hold its objects, joined with commas")
     parser.add_argument("--workers", type=_positive, default=1)
     parser.add_argument("--out", type=Path, required=True, help="folder for the scenes; what is there stays")
-    parser.set_defaults(run=lambda options: unpack(options.archive, options.objects, options.out, options.workers))
+    parser.add_argument(
+        "--more-views", type=int, default=0, metavar="N", help="show each scene's labels from N new cameras, too"
+    )
+    parser.set_defaults(run=_unpack)
+
+
+def _unpack(options: argparse.Namespace) -> dict[str, object]:
+    return unpack(options.archive, options.objects, options.out, options.workers, options.more_views)
 
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:

@@ -7,10 +7,10 @@ a scene is found by counts. Positions are kept to 0.02 mm, in the world.
 from __future__ import annotations
 
 import json
-import multiprocessing
 import os
 from collections.abc import Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from contextlib import contextmanager
+from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -19,14 +19,15 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from simharness.camera import PRESET_NOISE, Preset, observe_from
+from simharness.camera import PRESET_NOISE, Preset, observe_from, sample_camera
+from simharness.crew import Emit, Work, crew
 from simharness.objects import ObjectModel, load_object_set
 from simharness.scene import restore_scene
 from simharness.world import World
 from tesnet import cloud
 from tesnet.cloud import nearest_neighbours
 from tesnet.geometry import Pose
-from training.generate import observed_query
+from training.generate import is_free, observed_query
 from training.views import OUTCOMES, LabelledView, LabelsError, count_outcomes, load_scene, save_scene, scene_files
 
 RESOLUTION = 2e-5
@@ -36,6 +37,7 @@ LARGEST_SHIFT = 0.006
 """Candidates whose points have no point of the new cloud within so many metres are left out."""
 
 _SCENES_PER_PART = 1000
+_HEAR_S = 1.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -45,13 +47,14 @@ class ArchivedView:
     Args:
         Ts_world_camera: (V, 4, 4).
         pairs: (C, 3, 3) approach point, contact point and closing direction, in the world.
-        outcomes, collision_free: as in `LabelledView`.
+        outcomes: as in `LabelledView`.
+        collision_free: as there; None where it must be found out from the rendered cloud.
     """
 
     Ts_world_camera: NDArray[np.float64]
     pairs: NDArray[np.float64]
     outcomes: NDArray[np.uint8]
-    collision_free: NDArray[np.bool_]
+    collision_free: NDArray[np.bool_] | None
 
 
 def is_archive(folder: Path) -> bool:
@@ -78,7 +81,7 @@ def pack(folders: Sequence[Path], out: Path) -> dict[str, Any]:
     }
 
 
-def unpack(archive: Path, objects: str, out: Path, workers: int = 1) -> dict[str, Any]:
+def unpack(archive: Path, objects: str, out: Path, workers: int = 1, more_views: int = 0) -> dict[str, Any]:
     """Renders the scenes of an archive again, with noise of their own, as scene files in `out`.
 
     Scenes already there are left alone, so that a stopped run goes on.
@@ -88,27 +91,33 @@ def unpack(archive: Path, objects: str, out: Path, workers: int = 1) -> dict[str
         objects: the object sets that the scenes were made of, joined with commas.
         out: folder for the scene files.
         workers: processes.
+        more_views: views of each scene from new cameras. The outcome of a grasp depends on no camera, so such a view
+            shows all labels of its scene whose points it sees.
 
     Raises:
         LabelsError: no archive, or objects that the sets do not hold.
+        SimError: a worker failed.
     """
     parts = sorted(archive.glob("labels_*.npz"))
     if not parts:
         raise LabelsError(f"{archive} holds no labels_*.npz; make one with `python -m training pack`")
     out.mkdir(parents=True, exist_ok=True)
-    context = multiprocessing.get_context("spawn")
-    number = 0
-    with context.Pool(workers, _start_worker, (objects,)) as pool, tqdm(unit="scene") as progress:
+    known = {kind: set(models) for kind, models in _models_by_kind(objects).items()}
+    number = waiting = 0
+    with crew(_Renderer(objects, more_views), workers, ray=None) as renderers, tqdm(unit="scene") as progress:
         for part in parts:
-            jobs = []
             for description, views in _read_part(part):
+                if missing := sorted({item["name"] for item in description["objects"]} - known[description["kind"]]):
+                    raise LabelsError(f"--objects lacks {missing[0]}, which a scene of the archive holds; add its set")
                 path = out / f"scene_{number:07d}.npz"
                 number += 1
                 if not path.exists():
-                    jobs.append(pool.apply_async(_render_scene, (description, views, path)))
-            for job in jobs:
-                job.get()
-                progress.update()
+                    renderers.give(_Rendering(description, views, path))
+                    waiting += 1
+            while waiting:
+                done = len(renderers.hear(_HEAR_S))
+                waiting -= done
+                progress.update(done)
     return {"scenes": number}
 
 
@@ -232,33 +241,67 @@ def _read_part(path: Path) -> Iterator[tuple[dict[str, Any], list[ArchivedView]]
         yield {"kind": kind, "objects": objects}, views
 
 
-_models: dict[str, dict[str, ObjectModel]]
+@dataclass(frozen=True, eq=False, slots=True)
+class _Rendering:
+    """A scene to be rendered into a file."""
+
+    description: Mapping[str, Any]
+    views: Sequence[ArchivedView]
+    path: Path
 
 
-def _start_worker(objects: str) -> None:
-    global _models  # noqa: PLW0603  a pool's initializer has no other way to hand state to its jobs
-    os.nice(10)
-    torch.set_num_threads(1)
-    _models = {
+@dataclass(frozen=True, slots=True)
+class _Renderer:
+    """What a worker needs to render any scene."""
+
+    objects: str
+    more_views: int
+
+    def name(self, job: _Rendering) -> str:
+        """A scene in words."""
+        return job.path.stem.replace("_", " ")
+
+    @contextmanager
+    def begin(self) -> Iterator[Work[_Rendering]]:
+        """The object models, and what renders scenes of them."""
+        os.nice(10)
+        torch.set_num_threads(1)
+        models = _models_by_kind(self.objects)
+
+        def render(job: _Rendering, _: Emit) -> None:
+            _render_scene(job, models[job.description["kind"]], self.more_views)
+
+        yield render
+
+
+def _models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
+    return {
         kind: {model.name: model for name in objects.split(",") for model in load_object_set(name, kind)}
         for kind in ("packed", "pile")
     }
 
 
-def _render_scene(description: dict[str, Any], views: Sequence[ArchivedView], path: Path) -> None:
-    models = _models[description["kind"]]
-    if missing := sorted({item["name"] for item in description["objects"]} - models.keys()):
-        raise LabelsError(f"--objects lacks {missing[0]}, which a scene of the archive holds; add its set")
-    rng = np.random.default_rng([len(views), *(len(view.outcomes) for view in views)])
-    rendered = []
+def _render_scene(job: _Rendering, models: Mapping[str, ObjectModel], more_views: int) -> None:
+    rng = np.random.default_rng([len(job.views), *(len(view.outcomes) for view in job.views)])
+    views = list(job.views)
     with World() as world:
-        restore_scene(world, description, models)
-        for view in views:
-            labelled = _render_view(world, view, description["kind"], rng)
-            if labelled is not None:
-                rendered.append(labelled)
+        restore_scene(world, job.description, models)
+        rendered = [_render_view(world, view, job.description["kind"], rng) for view in views]
+        for _ in range(more_views if views else 0):
+            views.append(_from_elsewhere(job.views, rng))
+            rendered.append(_render_view(world, views[-1], job.description["kind"], rng))
     cameras = [view.Ts_world_camera.tolist() for view in views]
-    save_scene(path, description | {"cameras": cameras}, rendered)
+    save_scene(job.path, {**job.description, "cameras": cameras}, [view for view in rendered if view is not None])
+
+
+def _from_elsewhere(views: Sequence[ArchivedView], rng: np.random.Generator) -> ArchivedView:
+    """All labels of a scene, as one view from a new camera would have them."""
+    return ArchivedView(
+        np.stack([camera.matrix for camera in sample_camera("random", rng)]),
+        np.concatenate([view.pairs for view in views]),
+        np.concatenate([view.outcomes for view in views]),
+        None,
+    )
 
 
 def _render_view(world: World, view: ArchivedView, kind: str, rng: np.random.Generator) -> LabelledView | None:
@@ -271,12 +314,15 @@ def _render_view(world: World, view: ArchivedView, kind: str, rng: np.random.Gen
     pairs = torch.tensor(_moved(prepared.T_cloud_canonical.inverse(), view.pairs)).float()
     nearest = nearest_neighbours(prepared.points, 1, pairs[:, :2].reshape(-1, 3))[:, 0].view(-1, 2)
     near = ((prepared.points[nearest] - pairs[:, :2]).norm(dim=2) < LARGEST_SHIFT).all(dim=1)
-    return LabelledView(
+    shown = LabelledView(
         cloud=prepared,
         pairs=pairs[near],
         approach=nearest[near, 0],
         contact=nearest[near, 1],
         outcomes=torch.from_numpy(view.outcomes.copy())[near],
-        collision_free=torch.from_numpy(view.collision_free.copy())[near],
+        collision_free=torch.ones(int(near.sum()), dtype=torch.bool),
         scene=kind,
     )
+    if view.collision_free is None:
+        return replace(shown, collision_free=is_free(prepared, shown.candidates))
+    return replace(shown, collision_free=torch.from_numpy(view.collision_free.copy())[near])

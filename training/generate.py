@@ -250,6 +250,11 @@ def observed_query(observation: Observation, seed: int = 0) -> GraspQuery:
     )
 
 
+def is_free(prepared: cloud.PreparedCloud, found: candidates.Candidates) -> torch.Tensor:
+    """Mask (C,) of the candidates that the observed cloud leaves free, as the predictor finds them."""
+    return ~in_collision(prepared.points, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
+
+
 def _label_view(
     world: World,
     hand: Hand,
@@ -263,7 +268,7 @@ def _label_view(
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
-    free = ~in_collision(prepared.points, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
+    free = is_free(prepared, found)
     chosen = _choose(prepared, found, free, config, rng, network)
     if len(chosen) == 0:
         return None

@@ -1,14 +1,17 @@
 from __future__ import annotations
 
+import json
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from training.__main__ import main
 from training.archive import pack, unpack
-from training.generate import GenerateConfig, generate
-from training.views import LabelsError, load_scene, scene_files
+from training.generate import GenerateConfig, generate, is_free
+from training.views import LabelledView, LabelsError, load_scene, scene_files
 
 pytestmark = pytest.mark.sim
 
@@ -43,6 +46,34 @@ def test_an_archive_renders_the_views_and_labels_that_went_in(labels: Path, tmp_
                     zip(one.outcomes[same].tolist(), one.collision_free[same].tolist(), strict=True)
                 )
     assert 0.95 * account["labels"] <= kept <= account["labels"]
+
+
+def test_more_views_show_the_labels_of_their_scene_from_new_cameras(labels: Path, tmp_path: Path) -> None:
+    pack([labels], tmp_path / "archive")
+    unpack(tmp_path / "archive", "procedural-train", tmp_path / "again", more_views=3)
+    shown = 0
+    for before, after in zip(scene_files([labels]), scene_files([tmp_path / "again"]), strict=True):
+        old, (description, views) = load_scene(before)[1], load_scene(after)
+        cameras = [camera[0][:3] for camera in description["cameras"]]
+        assert len(cameras) == len(old) + 3
+        assert len({json.dumps(camera) for camera in cameras}) == len(cameras)
+        recorded = [_in_world(view) for view in old]
+        for view in views[len(old) :]:
+            poses, outcomes = _in_world(view)
+            shown += len(outcomes)
+            for pose, outcome in zip(poses, outcomes, strict=True):
+                assert any(
+                    outcome in of_old[np.abs(old_poses - pose).max(axis=(1, 2)) < 2e-2]
+                    for old_poses, of_old in recorded
+                )
+            assert torch.equal(view.collision_free, is_free(view.cloud, view.candidates))
+    assert shown > 0
+
+
+def _in_world(view: LabelledView) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Poses and outcomes of a view's labels."""
+    poses = view.cloud.T_cloud_canonical.matrix @ view.candidates.Ts_canonical_grasp.double().numpy()
+    return poses, view.outcomes.numpy()
 
 
 def test_rendering_goes_on_where_it_stopped(labels: Path, tmp_path: Path) -> None:
