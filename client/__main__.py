@@ -24,6 +24,8 @@ from client.session import DEFAULT_TIMEOUT, GraspClient
 from tesnet.geometry import FRAME_CONVENTIONS
 
 DEFAULT_URL = "http://127.0.0.1:8000"
+API_KEY_VARIABLE = "GRASP_API_KEY"
+"""Not an argument: other users of a machine can read those."""
 
 FOUND, NOTHING_FOUND, BAD_INPUT, SERVICE_ERROR = range(4)
 
@@ -37,7 +39,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
     if chosen.support_height is not None and chosen.up is None:
         parser.error("--support-height is measured along `up`; give --up as well, for instance --up 0 0 1")
     try:
-        with GraspClient(chosen.url, timeout=chosen.timeout) as client:
+        with GraspClient(chosen.url, timeout=chosen.timeout, api_key=os.environ.get(API_KEY_VARIABLE)) as client:
             reply = _ask(client, chosen)
     except (CloudFileError, GraspClientError) as error:
         print(f"{parser.prog}: {error}", file=sys.stderr)
@@ -154,7 +156,8 @@ def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m client",
         description="Ask the grasp service for grasps of a point cloud. Lengths are metres, in the frame of the cloud.",
-        epilog="Exit codes: 0 grasps found; 1 none found; 2 wrong usage or input; 3 no service, or it failed. "
+        epilog=f"{API_KEY_VARIABLE} in the environment holds the API key, where the service wants one. "
+        "Exit codes: 0 grasps found; 1 none found; 2 wrong usage or input; 3 no service, or it failed. "
         "Options left out get the service's defaults.",
     )
     add = parser.add_argument

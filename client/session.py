@@ -52,7 +52,13 @@ class _Plans:
     """What both clients know: where the service is, and which conversation each method holds with it."""
 
     def __init__(
-        self, base_url: str, *, timeout: float, retry: RetryPolicy | None, headers: Mapping[str, str] | None
+        self,
+        base_url: str,
+        *,
+        timeout: float,
+        retry: RetryPolicy | None,
+        api_key: str | None,
+        headers: Mapping[str, str] | None,
     ) -> None:
         parts = urlsplit(base_url)
         if parts.scheme not in ("http", "https") or not parts.hostname:
@@ -62,6 +68,8 @@ class _Plans:
         self._policy = retry or RetryPolicy()
         self._rng = random.Random()
         self._headers = {name: header_value(f"headers[{name!r}]", value) for name, value in (headers or {}).items()}
+        if api_key is not None:
+            self._headers["X-API-Key"] = header_value("api_key", api_key)
 
     def _ask(self, request: Request, parse: Callable[[Answer], T], timeout: float | None) -> Conversation[T]:
         seconds = self._timeout if timeout is None else _checked_timeout(timeout)
@@ -105,11 +113,12 @@ class GraspClient(_Plans):
         base_url: where the service is, such as `http://127.0.0.1:8000`; a path prefix is kept.
         timeout: seconds that a call may take in all, with its retries and the waits between them.
         retry: when to try again. Grasping is a pure computation, so trying a lost connection again is safe.
+        api_key: one of the service's `GRASP_API_KEYS`, where it has any.
         headers: sent with every request, for instance the credentials that a proxy before the service wants.
         transport: replaces the network, for tests and special transports.
 
     Raises:
-        InvalidArgument: a URL that is not http or https, a timeout that is not positive, an impossible header.
+        InvalidArgument: a URL that is not http or https, a timeout that is not positive, an impossible key or header.
 
     Every method raises the errors drawn in `client.errors`. Proxies that the environment names (`HTTPS_PROXY`, ...) are
     used, except for services on this machine.
@@ -121,10 +130,11 @@ class GraspClient(_Plans):
         *,
         timeout: float = DEFAULT_TIMEOUT,
         retry: RetryPolicy | None = None,
+        api_key: str | None = None,
         headers: Mapping[str, str] | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        super().__init__(base_url, timeout=timeout, retry=retry, headers=headers)
+        super().__init__(base_url, timeout=timeout, retry=retry, api_key=api_key, headers=headers)
         self._http = httpx.Client(transport=transport, mounts=_DIRECT)
 
     def grasps(
@@ -238,10 +248,11 @@ class AsyncGraspClient(_Plans):
         *,
         timeout: float = DEFAULT_TIMEOUT,
         retry: RetryPolicy | None = None,
+        api_key: str | None = None,
         headers: Mapping[str, str] | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        super().__init__(base_url, timeout=timeout, retry=retry, headers=headers)
+        super().__init__(base_url, timeout=timeout, retry=retry, api_key=api_key, headers=headers)
         self._http = httpx.AsyncClient(transport=transport, mounts=_DIRECT)
 
     async def grasps(

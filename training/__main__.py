@@ -109,10 +109,18 @@ def _add_unpack(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--objects", required=True, help="the sets that hold its objects, joined with commas")
     parser.add_argument("--workers", type=_positive, default=1)
     parser.add_argument("--out", type=Path, required=True, help="folder for the scenes; what is there stays")
-    parser.add_argument(
-        "--more-views", type=int, default=0, metavar="N", help="show each scene's labels from N new cameras, too"
-    )
+    _add_more_views(parser)
     parser.set_defaults(run=_unpack)
+
+
+def _add_more_views(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument(
+        "--more-views",
+        type=int,
+        default=0,
+        metavar="N",
+        help="of archives, show each scene's labels from N new cameras, too",
+    )
 
 
 def _unpack(options: argparse.Namespace) -> dict[str, object]:
@@ -125,10 +133,12 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
         "--data", type=Path, nargs="+", required=True, help="folders of labelled training scenes, or archives"
     )
     parser.add_argument("--objects", help="for archives: the sets that hold their objects, joined with commas")
+    _add_more_views(parser)
     parser.add_argument(
         "--validation", type=Path, nargs="+", required=True, help="folders of labelled validation scenes"
     )
     parser.add_argument("--preset", default="default", choices=sorted(PRESETS))
+    parser.add_argument("--start", type=Path, metavar="WEIGHTS", help="begin with these instead of random weights")
     parser.add_argument("--epochs", type=_positive, help="stop after so many, whatever the schedule")
     parser.add_argument("--threads", type=_positive, default=2)
     parser.add_argument("--seed", type=int, default=0)
@@ -149,6 +159,7 @@ def _fit(options: argparse.Namespace) -> dict[str, object]:
         threads=options.threads,
         seed=options.seed,
         version=options.version,
+        start=options.start,
     )
 
 
@@ -157,7 +168,7 @@ def _rendered(archive: Path, options: argparse.Namespace) -> Path:
     if options.objects is None:
         raise LabelsError(f"{archive} is an archive, whose clouds are rendered again; name its objects with --objects")
     folder: Path = options.out.parent / f"{archive.name}-rendered"
-    unpack(archive, options.objects, folder, options.threads)
+    unpack(archive, options.objects, folder, options.threads, options.more_views)
     return folder
 
 

@@ -70,8 +70,10 @@ PRESETS = {
 class _Progress:
     """What a checkpoint holds beside the tensors."""
 
+    recipe: dict[str, Any]
+    seed: int
+    learning_rate: float
     epoch: int = 0
-    learning_rate: float = 0.0
     best_loss: float = math.inf
     stagnant: int = 0
 
@@ -87,14 +89,29 @@ def fit(
     threads: int = 2,
     seed: int = 0,
     version: str = "0",
+    start: Path | None = None,
 ) -> dict[str, Any]:
     """Trains network `name`, writes its best weights to `out` and returns its validation measures.
 
     The network is asked about candidates that are free of collision with the observed cloud, as in the service; the
     classes are weighted to be balanced. After every epoch a checkpoint beside `out` lets a stopped run go on.
 
+    Args:
+        name: of the network.
+        data: folders of labelled training scenes.
+        validation: folders of labelled scenes that choose the epoch and fit the calibration.
+        recipe: how to train.
+        out: weights file.
+        epochs: stop after so many, whatever the recipe's schedule.
+        threads: of the CPU.
+        seed: of the first weights, of orders and of draws.
+        version: that the weights' header carries.
+        start: weights to begin with; None for random ones.
+
     Raises:
-        LabelsError: folders without usable labels.
+        LabelsError: folders without usable labels, a checkpoint of another recipe or seed, or `start` of another
+            network.
+        WeightsError: `start` cannot be read.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
@@ -111,7 +128,14 @@ def fit(
     network = networks.build(name)
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
-    progress = _resume(checkpoint, network, optimiser) or _Progress(learning_rate=recipe.learning_rate)
+    if start is not None:
+        first, header = networks.load(start)
+        if (header.network, first.config) != (name, network.config):
+            raise LabelsError(f"{start} holds a {header.network} of another configuration; begin without --start")
+        network.load_state_dict(first.state_dict())
+    progress = _resume(checkpoint, network, optimiser) or _Progress(asdict(recipe), seed, recipe.learning_rate)
+    if (progress.recipe, progress.seed) != (asdict(recipe), seed):
+        raise LabelsError(f"{checkpoint} is of another recipe or seed; use the same ones, or another --out")
     last_epoch = min(recipe.max_epochs, epochs or recipe.max_epochs)
     # Only halving ends the training: along the cosine the rate is small at the start, too.
     while progress.epoch < last_epoch and (recipe.cosine or progress.learning_rate >= recipe.smallest_learning_rate):

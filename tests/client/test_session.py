@@ -48,6 +48,14 @@ def test_a_request_id_is_made_up_and_kept_over_retries(
     assert len(first) == 32
 
 
+def test_an_api_key_is_sent_with_every_request(call: Call, server: ScriptedServer) -> None:
+    server.script = [answering(model_document())]
+    call(server.url, "model", client={"api_key": "s3cret"})
+    assert server.received[0].headers["x-api-key"] == "s3cret"
+    with pytest.raises(client.InvalidArgument, match="api_key"):
+        call(server.url, "model", client={"api_key": "two\nlines"})
+
+
 def test_a_path_prefix_and_headers_are_kept(call: Call, server: ScriptedServer) -> None:
     server.script = [answering(model_document())]
     call(f"{server.url}/robot/7/", "model", client={"headers": {"Authorization": "Bearer key"}})

@@ -65,6 +65,22 @@ def test_a_stopped_run_goes_on_from_its_checkpoint(folder: Path, tmp_path: Path)
     assert set(measured) == {"weights_sha256", "all", "packed"}
 
 
+def test_a_checkpoint_of_another_recipe_is_refused(folder: Path, tmp_path: Path) -> None:
+    run(folder, tmp_path / "a.safetensors", epochs=1)
+    for options in ({"recipe": replace(RECIPE, learning_rate=1e-3)}, {"seed": 1}):
+        with pytest.raises(LabelsError, match=r"a\.checkpoint is of another recipe or seed"):
+            run(folder, tmp_path / "a.safetensors", **options)
+
+
+def test_training_begins_with_given_weights(folder: Path, tmp_path: Path) -> None:
+    run(folder, tmp_path / "first.safetensors", epochs=1)
+    still = replace(RECIPE, learning_rate=1e-12, weight_decay=0.0, max_epochs=1)
+    run(folder, tmp_path / "second.safetensors", still, start=tmp_path / "first.safetensors")
+    first, second = (weights.load(tmp_path / f"{name}.safetensors")[0] for name in ("first", "second"))
+    for name, tensor in first.items():
+        torch.testing.assert_close(tensor, second[name], atol=1e-6, rtol=0)
+
+
 def test_training_learns_the_training_views(folder: Path, tmp_path: Path) -> None:
     recipe = replace(RECIPE, max_epochs=12, cosine=False, learning_rate=3e-3, views_per_step=1)
     run(folder, tmp_path / "a.safetensors", recipe)
@@ -82,7 +98,7 @@ def test_labels_without_a_usable_view_are_refused(tmp_path: Path, folder: Path) 
 
 def test_the_learning_rate_is_halved_after_stagnant_epochs() -> None:
     recipe = replace(PRESETS["paper"], patience=2)
-    progress = fitting._Progress(learning_rate=1e-4, best_loss=0.5)
+    progress = fitting._Progress({}, 0, learning_rate=1e-4, best_loss=0.5)
     rates = []
     for loss in (0.4, 0.6, 0.6, 0.6, 0.6, 0.3):
         fitting._schedule(recipe, progress, loss)
