@@ -19,6 +19,9 @@ from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
 TIP_BEYOND_CONTACT = 0.007
 """How far the fingertips reach past the depth of the contact point."""
 
+_PAIRS_AT_ONCE = 500_000
+"""Pairs of points whose offsets are in memory at a time, some 20 MB."""
+
 
 @dataclass(frozen=True, slots=True)
 class CandidateConfig:
@@ -174,6 +177,16 @@ def pairs_in_reach(
         approach_points: (A,) indices.
         config: the limits.
     """
+    found = [
+        _pairs_of_some(points, normals, some, config)
+        for some in approach_points.split(max(1, _PAIRS_AT_ONCE // max(1, len(points))))
+    ]
+    return torch.cat([approach for approach, _ in found]), torch.cat([contact for _, contact in found])
+
+
+def _pairs_of_some(
+    points: Tensor, normals: Tensor, approach_points: Tensor, config: CandidateConfig
+) -> tuple[Tensor, Tensor]:
     offsets = points[None] - points[approach_points][:, None]
     along_normal = (offsets * normals[None]).sum(dim=2)
     square = offsets.square().sum(dim=2)
