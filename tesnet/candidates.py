@@ -19,6 +19,9 @@ from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
 TIP_BEYOND_CONTACT = 0.007
 """How far the fingertips reach past the depth of the contact point."""
 
+_NEARLY_FARTHEST = 0.7
+"""Spreads points within 1.7 times the width of one by one (1.3 on average), at under 2 ms more for 128 of them."""
+
 _PAIRS_AT_ONCE = 500_000
 """Pairs of points whose offsets are in memory at a time, some 20 MB."""
 
@@ -127,11 +130,11 @@ def _search(
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
-    """Indices (min(count, P),) of points (P, 3) spread evenly, by farthest-point sampling that doubles each round.
+    """Indices (min(count, P),) of points (P, 3) spread evenly, by farthest-point sampling with several points a round.
 
-    In a round every chosen point's Voronoi cell yields its point farthest from it, so the number of rounds grows with
-    the logarithm of `count`; where fewer are wanted, the farthest ones are taken. Plain farthest-point sampling
-    (Gonzalez 1985) takes one point a round.
+    In a round every chosen point's Voronoi cell offers its point farthest from it, and those are taken that are at
+    least `_NEARLY_FARTHEST` as far as the farthest of all; where fewer are wanted, the farthest ones. Plain
+    farthest-point sampling (Gonzalez 1985) takes one point a round.
     """
     chosen = torch.tensor([start], device=points.device)
     distance = (points - points[start]).norm(dim=1)
@@ -145,6 +148,7 @@ def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
         new = first[(first < len(points))]
         if len(new) == 0:  # the remaining points coincide with chosen ones
             break
+        new = new[distance[new] >= _NEARLY_FARTHEST * distance.max()]
         new = new[distance[new].argsort(descending=True, stable=True)[: count - len(chosen)]]
         to_new = torch.cdist(points, points[new])
         nearest = to_new.min(dim=1)
