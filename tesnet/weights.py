@@ -146,17 +146,17 @@ def _check_sum(path: Path, data: bytes) -> None:
 
 
 def _tensors(path: Path, data: bytes) -> dict[str, Tensor]:
-    if data.startswith(_PICKLES):
-        why = (
-            "is a Python pickle (as torch.save writes .pt files), which may run any code when opened; only "
-            f"{_SUFFIX} files are loaded: convert it on the machine where it was trained"
-        )
-        raise WeightsError(path, why)
     try:
         return safetensors.torch.load(data)
     except (SafetensorError, KeyError, ValueError, RuntimeError) as error:
         if _is_cut_short(data):
             raise WeightsError(path, f"is cut short after {len(data)} bytes; get the file again") from error
+        if data.startswith(_PICKLES):
+            why = (
+                "is a Python pickle (as torch.save writes .pt files), which may run any code when opened; only "
+                f"{_SUFFIX} files are loaded: convert it on the machine where it was trained"
+            )
+            raise WeightsError(path, why) from error
         raise WeightsError(path, f"is not a safetensors file ({error}); give a {_SUFFIX} file") from error
 
 
