@@ -29,8 +29,8 @@ from tests.tesnet.scenes import (
 )
 
 # float32 coordinates, moved by up to half a metre, are exact to 6e-8 m; a normal turns by 1e-7. A point on the edge of
-# the region that a candidate looks at may therefore enter or leave it, and a probe on the edge of what the camera saw may
-# become unseen: that moves the logits of a few candidates more than rounding does.
+# the region that a candidate looks at may therefore enter or leave it, and a probe on the edge of what the camera saw
+# may become unseen: that moves the logits of a few candidates more than rounding does.
 LOGIT_TOLERANCE = 1e-3
 SHARE_AT_AN_EDGE = 0.02
 POSE_TOLERANCE = 3e-5

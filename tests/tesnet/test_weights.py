@@ -89,7 +89,7 @@ finite = st.floats(allow_nan=False, allow_infinity=False)
 def test_a_header_whose_length_looks_like_a_pickle_is_read(tmp_path: Path) -> None:
     path = tmp_path / "header.safetensors"
     for padding in range(1200):
-        header = Header("n", "1", {"padding": "x" * padding}, (1.0, 0.0), None)
+        header = Header("n", "1", {"padding": "x" * padding})
         weights.save(path, {}, header)
         if path.read_bytes().startswith(b"\x80\x02"):
             assert weights.load(path)[1] == header
