@@ -52,3 +52,10 @@ def test_files_and_modules_that_it_names_exist() -> None:
     for module in re.findall(r"python -m ([\w.]+)", PAGE):
         path = ROOT / module.replace(".", "/")
         assert path.with_suffix(".py").is_file() or (path / "__main__.py").is_file(), module
+
+
+def test_no_page_holds_the_marks_of_an_unfinished_merge() -> None:
+    pages = [*ROOT.glob("*.md"), *ROOT.glob("*/*.md")]
+    assert len(pages) > 5
+    for page in pages:
+        assert not re.search(r"^(<{7} |={7}$|>{7} )", page.read_text(encoding="utf-8"), re.MULTILINE), page
