@@ -12,14 +12,14 @@ from bench.table import processor
 from client import GraspClient
 from simharness.server import free_port
 
-WARM_UP_S = 60.0
+WARM_UP_S = 120.0
 """Before memory is first read: allocators take what they need once."""
 
 
 def main() -> None:
     """Measure and print a line a minute."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
-    parser.add_argument("--minutes", type=float, default=20.0, help="after a warm-up of at most a minute")
+    parser.add_argument("--minutes", type=float, default=20.0, help="after a warm-up of at most two minutes")
     parser.add_argument("--threads", type=int, default=2, help="CPU threads of the predictor")
     parser.add_argument("--points", type=int, default=20_000, help="points in the cloud")
     parser.add_argument("--candidates", type=int, default=1_500, help="most candidates")

@@ -9,12 +9,12 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from typing import Any
 
 import msgspec
 import numpy as np
-from fastapi import APIRouter, Request, Response
+from fastapi import APIRouter, Depends, Request, Response
 from numpy.typing import NDArray
 
 from service import schemas
@@ -178,35 +178,46 @@ def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: G
         endpoint.check_ready()
         return {"ready": True}
 
-    async def describe(model: str, version: str | None = None) -> schemas.ModelMetadata:
-        check_path(model, version)
-        return schemas.ModelMetadata(
-            name=model, versions=[worker.model.version], platform="pytorch", inputs=[INPUT], outputs=OUTPUTS
-        )
-
-    async def model_ready(model: str, version: str | None = None) -> dict[str, bool]:
-        check_path(model, version)
-        endpoint.check_ready()
-        return {"ready": True}
-
-    async def infer(request: Request, model: str, version: str | None = None) -> Response:
-        def reader_of(request: Request) -> Reader:
+    def add_model(path: str, version_of: Callable[..., str | None]) -> None:
+        @router.get(path, summary="Model metadata", responses=model_problems)
+        async def describe(model: str, version: str | None = Depends(version_of)) -> schemas.ModelMetadata:
             check_path(model, version)
-            return _reader(request, settings, worker)
+            return schemas.ModelMetadata(
+                name=model, versions=[worker.model.version], platform="pytorch", inputs=[INPUT], outputs=OUTPUTS
+            )
 
-        return await endpoint.answer(request, reader_of)
+        @router.get(f"{path}/ready", summary="Does the model take requests?", responses=model_problems)
+        async def model_ready(model: str, version: str | None = Depends(version_of)) -> dict[str, bool]:
+            check_path(model, version)
+            endpoint.check_ready()
+            return {"ready": True}
 
-    for path in ("/models/{model}", "/models/{model}/versions/{version}"):
-        router.get(path, summary="Model metadata", responses=model_problems)(describe)
-        router.get(f"{path}/ready", summary="Does the model take requests?", responses=model_problems)(model_ready)
-        router.post(
+        @router.post(
             f"{path}/infer",
             summary="Grasps for a point cloud",
             response_class=Response,
             responses=_INFER_RESPONSES | problems(*_INFER_PROBLEMS),
             openapi_extra=_INFER_REQUEST,
-        )(infer)
+        )
+        async def infer(request: Request, model: str, version: str | None = Depends(version_of)) -> Response:
+            def reader_of(request: Request) -> Reader:
+                check_path(model, version)
+                return _reader(request, settings, worker)
+
+            return await endpoint.answer(request, reader_of)
+
+    add_model("/models/{model}", _no_version)
+    add_model("/models/{model}/versions/{version}", _version_of_path)
     return router
+
+
+def _no_version() -> None:
+    """Any version of the network."""
+
+
+def _version_of_path(version: str) -> str:
+    """The version that the path names."""
+    return version
 
 
 def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> Reader:
