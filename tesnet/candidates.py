@@ -19,6 +19,10 @@ from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
 TIP_BEYOND_CONTACT = 0.007
 """How far the fingertips reach past the depth of the contact point."""
 
+_STEEPEST_RISE = 0.95
+_FARTHEST_ASIDE = 0.005
+"""Of the contact points of shallow pairs: cosine of the normal with `up`, metres beside the middle of the finger."""
+
 _NEARLY_FARTHEST = 0.7
 """Spreads points within 1.7 times the width of one by one (1.3 on average), at under 2 ms more for 128 of them."""
 
@@ -77,7 +81,8 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
     """At most `max_candidates` candidates, and how many pairs each mask dropped.
 
     Approach points lie on the target, if there is one. While they yield fewer than half of `max_candidates`, as beside
-    flat objects, four times as many are tried.
+    flat objects, four times as many are tried. Where there is no candidate in the end, as beside objects of 11 to 14 mm
+    on a support plane, those are taken that come straight down and are less deep.
     """
     allowed = torch.arange(len(cloud), device=cloud.points.device)
     if cloud.on_target is not None:
@@ -95,6 +100,9 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
         if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
             break
         count = min(4 * count, MAX_APPROACH_POINTS)  # time and memory grow with it
+    if not bool(alive.any()) and cloud.up is not None and cloud.support_height is not None:
+        candidates = _straight_down(cloud, cloud.up, config, approach_points)
+        alive, _ = _judge(cloud, query, config, candidates)
     survivors = alive.nonzero()[:, 0]
     if len(survivors) > query.max_candidates:
         chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values
@@ -115,18 +123,56 @@ def _search(
     approach, contact = pairs_in_reach(cloud.points, normals, approach_points, config)
     poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact])
     candidates = Candidates(approach, contact, poses)
+    return candidates, *_judge(cloud, query, config, candidates)
+
+
+def _judge(
+    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates
+) -> tuple[Tensor, dict[str, int]]:
+    """A mask of the candidates that no rule drops, and how many each rule does."""
+    poses = candidates.Ts_canonical_grasp
     masks = {
         "from_below": _comes_from_behind(cloud, candidates, config),
         "approach": _outside_cone(cloud, poses[:, :3, 2], query),
         "support": hand_clearance(cloud, poses, query.gripper) < config.support_clearance,
-        "target": _off_target(cloud, contact),
+        "target": _off_target(cloud, candidates.contact),
     }
     rejected = {}
     alive = torch.ones(len(candidates), dtype=torch.bool, device=poses.device)
     for name, bad in masks.items():
         rejected[name] = int((bad & alive).sum())
         alive &= ~bad
-    return candidates, alive, rejected
+    return alive, rejected
+
+
+def _straight_down(cloud: PreparedCloud, up: Tensor, config: CandidateConfig, approach_points: Tensor) -> Candidates:
+    """Pairs less deep than `min_depth`, for a hand that travels against `up` and closes along the levelled normal.
+
+    So shallow a pair says nothing of the direction of travel, but of flat things that lie on a plane it is known.
+    """
+    rise = cloud.normals @ up
+    level = torch.nn.functional.normalize(cloud.normals - rise[:, None] * up, dim=1)
+    contacts = (rise.abs() < _STEEPEST_RISE).nonzero()[:, 0]
+    found = []
+    for some in approach_points.split(max(1, _PAIRS_AT_ONCE // max(1, len(contacts)))):
+        offsets = cloud.points[contacts][None] - cloud.points[some][:, None]
+        along = (offsets * level[contacts][None]).sum(dim=2)
+        depth = -(offsets @ up)
+        square = offsets.square().sum(dim=2)
+        aside = (square - along.square() - depth.square()).clamp(min=0).sqrt()
+        ok = (
+            (square <= config.max_pair_distance**2)
+            & (depth >= 0)
+            & (depth < config.min_depth)
+            & (along >= config.min_offset)
+            & (along <= config.max_offset)
+            & (aside <= _FARTHEST_ASIDE)
+        )
+        which, contact = ok.nonzero(as_tuple=True)
+        found.append((some[which], contacts[contact], depth[ok]))
+    approach, contact, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
+    z = (-up).expand(len(approach), 3)
+    return Candidates(approach, contact, _poses(cloud.points[approach], z, level[contact], depth[:, None]))
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
@@ -217,10 +263,14 @@ def grasp_poses(approach_points: Tensor, contact_points: Tensor, contact_normals
     depth = d_perp.norm(dim=1, keepdim=True)
     z = d_perp / depth
     y = contact_normals - (contact_normals * z).sum(dim=1, keepdim=True) * z
-    y = y / y.norm(dim=1, keepdim=True)
+    return _poses(approach_points, z, y / y.norm(dim=1, keepdim=True), depth)
+
+
+def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor) -> Tensor:
+    """TCP poses (C, 4, 4) of hands whose tips stop 7 mm past the depth (C, 1) under the approach points."""
     x = torch.linalg.cross(y, z, dim=1)
     tcp = approach_points + (depth + TIP_BEYOND_CONTACT - PANDA.tip_offset) * z
-    poses = torch.zeros(len(d), 4, 4, dtype=d.dtype, device=d.device)
+    poses = torch.zeros(len(z), 4, 4, dtype=z.dtype, device=z.device)
     poses[:, :3, :] = torch.stack([x, y, z, tcp], dim=2)
     poses[:, 3, 3] = 1
     return poses

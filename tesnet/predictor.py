@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import time
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -16,7 +16,7 @@ from tesnet.errors import DeviceError, WeightsError
 from tesnet.geometry import PANDA, GraspSet, Gripper
 from tesnet.networks import Network
 from tesnet.networks.tesnet import CloudFeatures
-from tesnet.query import Box, GraspQuery
+from tesnet.query import MAX_APPROACH_POINTS, Box, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 
 COARSEST_RESOLUTION = 0.0005
@@ -24,6 +24,12 @@ COARSEST_RESOLUTION = 0.0005
 
 APPROACH_DISTANCE = 0.05
 """Length of the straight approach that is kept clear of observed points, metres."""
+
+GOOD_SCORE = 0.9
+"""While the best score is lower, other candidates are searched for."""
+
+FURTHER_SEARCHES = 4
+"""At most so often, each time with four times as many approach points as the query names."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -138,18 +144,19 @@ class GraspPredictor:
         notes += _cloud_warnings(prepared, self._preparation)
         notes += _target_warnings(prepared)
 
-        found, dropped = candidates.generate(prepared, query, self._candidates)
-        rejected |= dropped
-        blocked = self._blocked(prepared, found, query)
-        free = found.select(~blocked)
-        rejected["collision"] = int(blocked.sum())
+        found = self._search(prepared, query)
         self._synchronise()
         clock.lap("candidates")
-        sizes = (len(prepared), len(found), len(free))
-        if len(free) == 0:
-            reason = "all_in_collision" if len(found) else "no_candidates"
-            return _nothing(query, reason, sizes, rejected, notes, clock)
-        return _Proposal(query, prepared, free, sizes, rejected, notes, clock)
+        if len(found.free) == 0:
+            reason = "all_in_collision" if found.count else "no_candidates"
+            sizes = (len(prepared), found.count, 0)
+            return _nothing(query, reason, sizes, rejected | found.rejected, notes, clock)
+        return _Proposal(query, prepared, found, notes, clock)
+
+    def _search(self, prepared: cloud.PreparedCloud, query: GraspQuery) -> _Found:
+        found, rejected = candidates.generate(prepared, query, self._candidates)
+        blocked = self._blocked(prepared, found, query)
+        return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
 
     def _encode(self, proposals: Sequence[_Proposal]) -> list[CloudFeatures]:
         """The features of each proposal's cloud, whose clock is told its share of the pass."""
@@ -164,33 +171,49 @@ class GraspPredictor:
         return features
 
     def _rank(self, proposal: _Proposal, features: CloudFeatures) -> GraspResult:
-        """The proposal's candidates, scored and ranked."""
-        query, prepared, free, clock = proposal.query, proposal.prepared, proposal.free, proposal.clock
+        """The proposal's candidates, scored and ranked; others in their place, if only those score well."""
+        query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
         clock.start()
-        logits = self._network.score(features, prepared, free)
-        a, b = self._calibration
-        scores = torch.sigmoid(a * logits + b)
-        self._synchronise()
+        found, scores = proposal.found, self._scores(features, prepared, proposal.found)
         clock.lap("network")
+        for number in range(1, FURTHER_SEARCHES + 1):
+            # Where a search yields few candidates it has tried every approach point.
+            if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates:
+                break
+            other = self._search(prepared, _further(query, number))
+            self._synchronise()
+            clock.lap("candidates")
+            if len(other.free):
+                other_scores = self._scores(features, prepared, other)
+                if float(other_scores.max()) > float(scores.max()):
+                    found, scores = other, other_scores
+                clock.lap("network")
 
         ranked = ranking.rank(
             scores,
-            free.Ts_canonical_grasp,
+            found.free.Ts_canonical_grasp,
             max_grasps=query.max_grasps,
             min_score=query.min_score,
             separation_translation=query.separation_translation,
             separation_rotation_deg=query.separation_rotation_deg,
         )
-        rejected = proposal.rejected | {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
-        grasps = _grasps(prepared, free, scores, ranked.indices, query.gripper.max_width)
+        last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
+        rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
+        grasps = _grasps(prepared, found.free, scores, ranked.indices, query.gripper.max_width)
         clock.lap("rank")
         return GraspResult(
             grasps=grasps,
-            counts=GraspCounts(len(query.points), *proposal.sizes, len(grasps), rejected),
+            counts=GraspCounts(len(query.points), len(prepared), found.count, len(found.free), len(grasps), rejected),
             reason=None if len(grasps) else "below_min_score",
             warnings=tuple(proposal.notes),
             timings_ms=clock.laps_ms,
         )
+
+    def _scores(self, features: CloudFeatures, prepared: cloud.PreparedCloud, found: _Found) -> torch.Tensor:
+        a, b = self._calibration
+        scores = torch.sigmoid(a * self._network.score(features, prepared, found.free) + b)
+        self._synchronise()
+        return scores
 
     def _blocked(self, prepared: cloud.PreparedCloud, found: candidates.Candidates, query: GraspQuery) -> torch.Tensor:
         poses, hand = found.Ts_canonical_grasp, query.gripper
@@ -234,26 +257,43 @@ class _Clock:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
+class _Found:
+    """What a search found.
+
+    Args:
+        free: candidates without collision.
+        count: candidates in all.
+        rejected: pairs or candidates dropped, by step.
+    """
+
+    free: candidates.Candidates
+    count: int
+    rejected: dict[str, int]
+
+
+@dataclass(frozen=True, eq=False, slots=True)
 class _Proposal:
     """A query whose candidates are to be scored.
 
     Args:
         query: what is asked.
         prepared: its cloud.
-        free: its candidates without collision, at least one.
-        sizes: numbers of prepared points, of candidates and of those without collision.
-        rejected: candidates dropped so far, by step.
+        found: at least one candidate without collision.
         notes: warnings for the answer.
         clock: the time of its stages.
     """
 
     query: GraspQuery
     prepared: cloud.PreparedCloud
-    free: candidates.Candidates
-    sizes: tuple[int, int, int]
-    rejected: dict[str, int]
+    found: _Found
     notes: list[str]
     clock: _Clock
+
+
+def _further(query: GraspQuery, number: int) -> GraspQuery:
+    """The query, for its further search of this number."""
+    count = min(4 * query.num_approach_points, MAX_APPROACH_POINTS)
+    return replace(query, num_approach_points=count, seed=(query.seed + number) % 2**63)
 
 
 def configuration_of(network_config: Any) -> dict[str, dict[str, Any]]:

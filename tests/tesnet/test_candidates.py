@@ -15,7 +15,18 @@ from tesnet import candidates, cloud
 from tesnet.candidates import CandidateConfig, Candidates
 from tesnet.geometry import PANDA
 from tesnet.query import ApproachCone
-from tests.tesnet.scenes import CAMERA, UP, Array, ask, bare_cloud, prepared, tabletop, tabletop_query
+from tests.tesnet.scenes import (
+    CAMERA,
+    UP,
+    Array,
+    ask,
+    bare_cloud,
+    box_surface,
+    prepared,
+    seen_from,
+    tabletop,
+    tabletop_query,
+)
 
 CONFIG = CandidateConfig()
 ROUNDING = 1e-6
@@ -271,3 +282,26 @@ def test_hands_close_level_on_walls_that_are_nearly_upright_and_only_there() -> 
     turned = torch.rad2deg(torch.acos((levelled * cloud_.normals).sum(dim=1).clamp(-1, 1)))[nearly]
     torch.testing.assert_close(turned, tilt[nearly], atol=0.1, rtol=0)
     assert candidates.contact_normals(replace(cloud_, up=None), CONFIG) is cloud_.normals
+
+
+@pytest.mark.parametrize("height", [0.0125, 0.0135])
+def test_hands_come_straight_down_on_things_too_low_for_any_other_candidate(height: float) -> None:
+    points, normals = box_surface((0.05, 0.07, height), 60_000, np.random.default_rng(0))
+    seen = seen_from(points + height / 2 * UP, normals, CAMERA)
+    query = ask(seen, viewpoints=CAMERA, up=UP, support_height=0.0)
+    flat = prepared(query)
+    found, rejected = candidates.generate(flat, query, CONFIG)
+    assert len(found) > 0
+    assert rejected["support"] > 0
+    assert flat.up is not None
+    up = exact(flat.up)
+    rotations = exact(found.Ts_canonical_grasp[:, :3, :3])
+    np.testing.assert_allclose(rotations[:, :, 2] @ up, -1, atol=1e-5)
+    np.testing.assert_allclose(rotations[:, :, 1] @ up, 0, atol=1e-5)
+    np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-5)
+    assert (lowest_corner(flat, found) >= CONFIG.support_clearance - 1e-6).all()
+    pairs = exact(flat.points[found.contact] - flat.points[found.approach])
+    depth = -(pairs @ up)
+    assert ((depth >= 0) & (depth < CONFIG.min_depth)).all()
+    tips = exact(found.Ts_canonical_grasp[:, :3, 3]) @ up - PANDA.tip_offset
+    np.testing.assert_allclose(tips, exact(flat.points[found.approach]) @ up - depth - 0.007, atol=1e-6)

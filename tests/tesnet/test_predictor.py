@@ -12,7 +12,8 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from tesnet import weights
+from tesnet import cloud, weights
+from tesnet import predictor as predictor_module
 from tesnet.errors import DeviceError, WeightsError
 from tesnet.geometry import PANDA
 from tesnet.predictor import GraspPredictor, configuration_of
@@ -243,10 +244,37 @@ def test_the_global_random_state_is_neither_read_nor_changed() -> None:
     np.testing.assert_array_equal(result.grasps.scores, answer().grasps.scores)
 
 
-def test_scores_are_calibrated_logits() -> None:
+def test_scores_are_calibrated_logits(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(predictor_module, "FURTHER_SEARCHES", 0)  # low scores would begin one
     plain = fresh_predictor(calibration=(1.0, 0.0)).predict(tabletop_query()).grasps.scores
     logits = np.log(plain / (1 - plain))
-    np.testing.assert_allclose(answer().grasps.scores, 1 / (1 + np.exp(-(8.0 * logits + 0.5))), atol=1e-5)
+    sharper = fresh_predictor(calibration=(8.0, 0.5)).predict(tabletop_query()).grasps.scores
+    np.testing.assert_allclose(sharper, 1 / (1 + np.exp(-(8.0 * logits + 0.5))), atol=1e-5)
+
+
+def test_other_candidates_are_searched_for_while_the_best_score_is_low(monkeypatch: pytest.MonkeyPatch) -> None:
+    predictor = fresh_predictor()
+    query = tabletop_query(max_candidates=300)
+    searches = []
+    search = predictor._search
+
+    def note(prepared: cloud.PreparedCloud, asked: GraspQuery) -> Any:
+        found = search(prepared, asked)
+        searches.append((asked.num_approach_points, asked.seed, found.count))
+        return found
+
+    monkeypatch.setattr(predictor, "_search", note)
+    best = predictor.predict(query)
+    assert [count for count, _, _ in searches] == [32] + [128] * predictor_module.FURTHER_SEARCHES
+    assert len({seed for _, seed, _ in searches}) == len(searches)
+    assert best.counts.candidates == 300
+    assert best.counts.collision_free + best.counts.rejected["collision"] == 300
+    monkeypatch.setattr(predictor_module, "FURTHER_SEARCHES", 0)
+    first = predictor.predict(query)
+    assert best.grasps.scores[0] > first.grasps.scores[0]
+    monkeypatch.setattr(predictor_module, "FURTHER_SEARCHES", 4)
+    monkeypatch.setattr(predictor_module, "GOOD_SCORE", float(first.grasps.scores[0]))
+    np.testing.assert_array_equal(predictor.predict(query).grasps.scores, first.grasps.scores)
 
 
 # Loading
