@@ -169,10 +169,11 @@ def _straight_down(cloud: PreparedCloud, up: Tensor, config: CandidateConfig, ap
             & (aside <= _FARTHEST_ASIDE)
         )
         which, contact = ok.nonzero(as_tuple=True)
-        found.append((some[which], contacts[contact], depth[ok]))
-    approach, contact, depth = (torch.cat(parts) for parts in zip(*found, strict=True))
-    z = (-up).expand(len(approach), 3)
-    return Candidates(approach, contact, _poses(cloud.points[approach], z, level[contact], depth[:, None]))
+        found.append((some[which], contacts[contact]))
+    approach, contact = (torch.cat(parts) for parts in zip(*found, strict=True))
+    down = (-up).expand(len(approach), 3)
+    poses = poses_along(cloud.points[approach], cloud.points[contact], level[contact], down)
+    return Candidates(approach, contact, poses)
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
@@ -264,6 +265,15 @@ def grasp_poses(approach_points: Tensor, contact_points: Tensor, contact_normals
     z = d_perp / depth
     y = contact_normals - (contact_normals * z).sum(dim=1, keepdim=True) * z
     return _poses(approach_points, z, y / y.norm(dim=1, keepdim=True), depth)
+
+
+def poses_along(approach_points: Tensor, contact_points: Tensor, closing: Tensor, travel: Tensor) -> Tensor:
+    """TCP poses (C, 4, 4) of pairs of points (C, 3) whose unit directions of closing and travel (C, 3) are known.
+
+    Those of `grasp_poses` where the directions are; depth is measured along the travel.
+    """
+    depth = ((contact_points - approach_points) * travel).sum(dim=1, keepdim=True)
+    return _poses(approach_points, travel, closing, depth)
 
 
 def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor) -> Tensor:

@@ -25,6 +25,7 @@ from simharness.objects import ObjectModel, load_object_set
 from simharness.scene import restore_scene
 from simharness.world import World
 from tesnet import cloud
+from tesnet.candidates import grasp_poses
 from tesnet.cloud import nearest_neighbours
 from tesnet.geometry import Pose
 from training.generate import is_free, observed_query
@@ -36,6 +37,11 @@ RESOLUTION = 2e-5
 LARGEST_SHIFT = 0.006
 """Candidates whose points have no point of the new cloud within so many metres are left out."""
 
+_DOWN = np.array([0.0, 0.0, -1.0])
+_STRAIGHT = 1 - 1e-6
+"""Cosine of the angle with straight down, 0.08 degrees, up to which a direction of travel is kept as a mere flag: that
+of shallow pairs does not follow from their points."""
+
 _SCENES_PER_PART = 1000
 _HEAR_S = 1.0
 
@@ -46,7 +52,7 @@ class ArchivedView:
 
     Args:
         Ts_world_camera: (V, 4, 4).
-        pairs: (C, 3, 3) approach point, contact point and closing direction, in the world.
+        pairs: (C, 4, 3) as in `LabelledView`, in the world.
         outcomes: as in `LabelledView`.
         collision_free: as there; None where it must be found out from the rendered cloud.
     """
@@ -133,7 +139,7 @@ def _read_scene(path: Path) -> tuple[dict[str, Any], list[ArchivedView]]:
 
 
 def _moved(T_b_a: Pose, pairs: NDArray[np.float64]) -> NDArray[np.float64]:
-    """Pairs (C, 3, 3), two points and a direction in frame a, in frame b."""
+    """Pairs (C, 4, 3), two points and two directions in frame a, in frame b."""
     return np.concatenate([T_b_a.apply(pairs[:, :2]), T_b_a.rotate(pairs[:, 2:])], axis=1)
 
 
@@ -179,6 +185,7 @@ def _write_part(path: Path, scenes: Sequence[tuple[Mapping[str, Any], Sequence[A
             add("closing_direction", contact[:, 3:], np.int16)
             add("approach", which_approach.ravel(), np.uint16)
             add("contact", which_contact.ravel(), np.uint16)
+            add("straight_down", view.pairs[:, 3] @ _DOWN > _STRAIGHT, np.bool_)
             add("outcome", view.outcomes, np.uint8)
             add("collision_free", view.collision_free, np.bool_)
     arrays = {name: np.concatenate(values) for name, values in columns.items()}
@@ -202,6 +209,8 @@ def _read_part(path: Path) -> Iterator[tuple[dict[str, Any], list[ArchivedView]]
     names = json.loads(arrays.pop("names").tobytes())
     for name in ("approach_point", "contact_point", "closing_direction"):
         arrays[name] = arrays[name].T
+    # Parts from before there were shallow pairs have no such column.
+    arrays.setdefault("straight_down", np.zeros(len(arrays["outcome"]), dtype=np.bool_))
     position = dict.fromkeys(arrays, 0)
 
     def take(name: str, count: int) -> NDArray[Any]:
@@ -235,10 +244,29 @@ def _read_part(path: Path) -> Iterator[tuple[dict[str, Any], list[ArchivedView]]
             contact = take("contact_point", num_contact) * RESOLUTION
             closing = take("closing_direction", num_contact) / np.iinfo(np.int16).max
             which_approach, which_contact = take("approach", num_labels), take("contact", num_labels)
-            pairs = np.stack([approach[which_approach], contact[which_contact], closing[which_contact]], axis=1)
+            pairs = _pairs(
+                approach[which_approach],
+                contact[which_contact],
+                closing[which_contact],
+                straight_down=take("straight_down", num_labels),
+            )
             views.append(ArchivedView(cameras, pairs, take("outcome", num_labels), take("collision_free", num_labels)))
         kind = "pile" if pile else "packed"
         yield {"kind": kind, "objects": objects}, views
+
+
+def _pairs(
+    approach: NDArray[np.float64],
+    contact: NDArray[np.float64],
+    closing: NDArray[np.float64],
+    *,
+    straight_down: NDArray[np.bool_],
+) -> NDArray[np.float64]:
+    """Pairs (C, 4, 3) from points (C, 3), closing directions of about unit length and a mask of what travels so."""
+    closing = closing / np.linalg.norm(closing, axis=1, keepdims=True)
+    poses = grasp_poses(*(torch.from_numpy(rows) for rows in (approach, contact, closing))).numpy()
+    travel = np.where(straight_down[:, None], _DOWN, poses[:, :3, 2])
+    return np.stack([approach, contact, np.where(straight_down[:, None], closing, poses[:, :3, 1]), travel], axis=1)
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -40,7 +40,7 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
         support_height=height if keep_up and chance >= WITHHOLD_UP + WITHHOLD_SUPPORT else None,
         T_cloud_canonical=cloud.T_cloud_canonical @ Pose(rotation, rotation @ -centre.double().numpy()).inverse(),
     )
-    shift = torch.stack([centre, centre, torch.zeros(3)])  # two points and a direction
+    shift = torch.stack([centre, centre, torch.zeros(3), torch.zeros(3)])  # two points and two directions
     return replace(view, cloud=turned, pairs=(view.pairs - shift) @ turn.T)
 
 

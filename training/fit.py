@@ -53,7 +53,7 @@ class Recipe:
     cosine: bool = True
     views_per_step: int = 4
     candidates_per_view: int = 120
-    blocked_per_view: int = 30
+    blocked_per_view: int = 60
 
 
 PRESETS = {
@@ -95,8 +95,8 @@ def fit(
 ) -> dict[str, Any]:
     """Trains network `name`, writes its best weights to `out` and returns its validation measures.
 
-    The network is asked about candidates that are free of collision with the observed cloud, as in the service; the
-    classes are weighted to be balanced. After every epoch a checkpoint beside `out` lets a stopped run go on.
+    Most candidates that the network is asked about are free of collision with the observed cloud, as in the service;
+    the classes are weighted to be balanced. After every epoch a checkpoint beside `out` lets a stopped run go on.
 
     Args:
         name: of the network.
@@ -124,9 +124,8 @@ def fit(
             "generate more labels, or with more labels per view"
         )
     validation_views = list(load_views(validation))
-    free = sum(int(view.collision_free.sum()) for view in train_views)
     labels = sum(len(view.outcomes) for view in train_views)
-    prior = sum(int((view.success & view.collision_free).sum()) for view in train_views) / free
+    prior = _share_of_successes(train_views, recipe)
     network = networks.build(name)
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
@@ -161,6 +160,21 @@ def fit(
                                   "seconds": time.monotonic() - started}) + "\n")  # fmt: skip
     _, header = weights.load(out)
     return dict(header.training or {})
+
+
+def _share_of_successes(views: Sequence[LabelledView], recipe: Recipe) -> float:
+    """The share of successes among the candidates that an epoch shows, on average."""
+    shown = expected = 0.0
+    for view in views:
+        for mask, most in (
+            (view.collision_free, recipe.candidates_per_view),
+            (~view.collision_free, recipe.blocked_per_view),
+        ):
+            count = int(mask.sum())
+            part = min(1.0, most / max(1, count))
+            shown += part * count
+            expected += part * int((view.success & mask).sum())
+    return expected / shown
 
 
 def _optimiser(network: Network, recipe: Recipe) -> torch.optim.Optimizer:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tesnet.candidates import Candidates, grasp_poses
+from tesnet.candidates import Candidates, poses_along
 from tesnet.cloud import PreparationConfig, PreparedCloud, estimate_normals, orient_normals
 from tesnet.geometry import Pose
 
@@ -32,7 +32,7 @@ class LabelledView:
 
     Args:
         cloud: in its canonical frame.
-        pairs: (C, 3, 3) approach point, contact point and closing direction of each candidate.
+        pairs: (C, 4, 3) approach point, contact point, and directions of closing and travel of each candidate.
         approach, contact: (C,) the points of the cloud nearest to those of the pairs: where the cloud was rendered
             again, no point lies just there.
         outcomes: (C,) codes into `OUTCOMES`.
@@ -51,8 +51,7 @@ class LabelledView:
     @property
     def candidates(self) -> Candidates:
         """The candidates with the poses that were tried."""
-        tried = grasp_poses(self.pairs[:, 0], self.pairs[:, 1], torch.nn.functional.normalize(self.pairs[:, 2], dim=1))
-        return Candidates(self.approach, self.contact, tried)
+        return Candidates(self.approach, self.contact, poses_along(*self.pairs.unbind(dim=1)))
 
     @property
     def success(self) -> torch.Tensor:
@@ -100,9 +99,9 @@ def save_scene(path: Path, description: Mapping[str, Any], views: Sequence[Label
 
 
 def pairs_of(cloud: PreparedCloud, candidates: Candidates) -> torch.Tensor:
-    """(C, 3, 3) approach points, contact points and closing directions of a cloud's own candidates."""
-    closing = candidates.Ts_canonical_grasp[:, :3, 1]
-    return torch.stack([cloud.points[candidates.approach], cloud.points[candidates.contact], closing], dim=1)
+    """(C, 4, 3) approach points, contact points and directions of closing and travel of a cloud's own candidates."""
+    _, closing, travel = candidates.Ts_canonical_grasp[:, :3, :3].unbind(dim=2)
+    return torch.stack([cloud.points[candidates.approach], cloud.points[candidates.contact], closing, travel], dim=1)
 
 
 def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
@@ -124,6 +123,8 @@ def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
 
 def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     frame = json.loads(arrays[f"{number}/frame"].tobytes())
+    if arrays[f"{number}/pairs"].shape[1:] != (4, 3):
+        raise ValueError("its pairs have no directions of travel")
 
     def tensor(name: str, dtype: torch.dtype) -> torch.Tensor:
         array = arrays[f"{number}/{name}"]

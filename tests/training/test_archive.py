@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -11,7 +12,7 @@ import torch
 from training.__main__ import main
 from training.archive import pack, unpack
 from training.generate import GenerateConfig, generate, is_free
-from training.views import LabelledView, LabelsError, load_scene, scene_files
+from training.views import LabelledView, LabelsError, load_scene, save_scene, scene_files
 
 pytestmark = pytest.mark.sim
 
@@ -68,6 +69,28 @@ def test_more_views_show_the_labels_of_their_scene_from_new_cameras(labels: Path
                 )
             assert torch.equal(view.collision_free, is_free(view.cloud, view.candidates))
     assert shown > 0
+
+
+def test_shallow_pairs_come_back_straight_down(labels: Path, tmp_path: Path) -> None:
+    path = next(path for path in scene_files([labels]) if load_scene(path)[1])
+    description, (view, *others) = load_scene(path)
+    to_canonical = view.cloud.T_cloud_canonical.inverse()
+    directions = torch.tensor(to_canonical.rotate(np.array([[1.0, 0.0, 0.0], [0.0, 0.0, -1.0]]))).float()
+    pairs = view.pairs.clone()
+    pairs[:, 1] = pairs[:, 0]
+    pairs[:, 2:] = directions
+    (tmp_path / "shallow").mkdir()
+    save_scene(tmp_path / "shallow" / path.name, description, [replace(view, pairs=pairs), *others])
+    pack([tmp_path / "shallow"], tmp_path / "archive")
+    unpack(tmp_path / "archive", "procedural-train", tmp_path / "again", more_views=1)
+    again = load_scene(tmp_path / "again" / path.name)[1]
+    assert len(again) == len(others) + 2
+    poses, _ = _in_world(again[0])
+    assert len(poses) > 0
+    np.testing.assert_allclose(
+        poses[:, :3, 1:3].swapaxes(1, 2), np.tile([[1.0, 0, 0], [0, 0, -1]], (len(poses), 1, 1)), atol=1e-4
+    )
+    assert all(np.isfinite(_in_world(view)[0]).all() for view in again)
 
 
 def _in_world(view: LabelledView) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:

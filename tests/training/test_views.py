@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -40,6 +41,24 @@ def test_labels_round_trip(tmp_path: Path) -> None:
         torch.testing.assert_close(after.cloud.up, before.cloud.up)
         assert after.cloud.support_height == before.cloud.support_height
         np.testing.assert_array_equal(after.cloud.T_cloud_canonical.matrix, before.cloud.T_cloud_canonical.matrix)
+
+
+def test_poses_of_shallow_pairs_round_trip(tmp_path: Path) -> None:
+    """Their direction of travel does not follow from their points, which may even be one and the same."""
+    view = labelled_view(count=30)
+    assert view.cloud.up is not None
+    pairs = view.pairs.clone()
+    pairs[:, 1] = pairs[:, 0]
+    pairs[:, 2] = torch.linalg.cross(view.cloud.up.expand(30, 3), torch.randn(30, 3))
+    pairs[:, 2] /= pairs[:, 2].norm(dim=1, keepdim=True)
+    pairs[:, 3] = -view.cloud.up
+    shallow = replace(view, pairs=pairs)
+    save_scene(tmp_path / "scene_0.npz", {}, [shallow])
+    (stored,) = load_scene(tmp_path / "scene_0.npz")[1]
+    poses = stored.candidates.Ts_canonical_grasp
+    assert torch.equal(poses, shallow.candidates.Ts_canonical_grasp)
+    torch.testing.assert_close(poses[:, :3, 2], -view.cloud.up.expand(30, 3))
+    torch.testing.assert_close(poses[:, :3, 1], pairs[:, 2])
 
 
 def test_a_scene_without_views_round_trips(tmp_path: Path) -> None:
