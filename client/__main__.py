@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
+import signal
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -19,7 +20,7 @@ from numpy.typing import NDArray
 from client.cloud_file import READERS, CloudFileError, decode_cloud, read_bytes, read_cloud, read_npy
 from client.errors import GraspClientError, InvalidArgument, Overloaded, ProblemError
 from client.reply import GraspReply
-from client.request import GraspOptions, GripperSize
+from client.request import DEFAULT_DEPTH_SCALE, GraspOptions, GripperSize
 from client.session import DEFAULT_TIMEOUT, GraspClient
 from tesnet.geometry import FRAME_CONVENTIONS
 
@@ -34,8 +35,10 @@ def main(arguments: Sequence[str] | None = None) -> int:
     """Run the command; returns the exit code."""
     parser = _parser()
     chosen = parser.parse_args(arguments)
-    if chosen.intrinsics is None and (chosen.mask is not None or chosen.camera_pose is not None):
-        parser.error("--mask and --camera-pose belong to a depth image; give its --intrinsics as well")
+    if chosen.intrinsics is None and any(
+        value is not None for value in (chosen.mask, chosen.camera_pose, chosen.depth_scale)
+    ):
+        parser.error("--mask, --camera-pose and --depth-scale belong to a depth image; give its --intrinsics as well")
     if chosen.support_height is not None and chosen.up is None:
         parser.error("--support-height is measured along `up`; give --up as well, for instance --up 0 0 1")
     try:
@@ -68,7 +71,7 @@ def _ask(client: GraspClient, chosen: argparse.Namespace) -> GraspReply:
         intrinsics={"fx": fx, "fy": fy, "cx": cx, "cy": cy},
         mask=None if chosen.mask is None else read_bytes(chosen.mask),
         T_cloud_camera=None if chosen.camera_pose is None else np.reshape(chosen.camera_pose, (4, 4)),
-        depth_scale=chosen.depth_scale,
+        depth_scale=DEFAULT_DEPTH_SCALE if chosen.depth_scale is None else chosen.depth_scale,
         request_id=chosen.request_id,
         **options,
     )
@@ -178,7 +181,7 @@ def _parser() -> argparse.ArgumentParser:
     add("--intrinsics", type=_number, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="its camera, in pixels")
     add("--mask", type=Path, metavar="FILE", help="8-bit .png of the same size; only what it marks is grasped")
     add("--camera-pose", type=_number, nargs=16, metavar="M", help="T_cloud_camera, row by row (default: identity)")
-    add("--depth-scale", type=_number, default=0.001, metavar="M", help="metres per count (default: %(default)g)")
+    add("--depth-scale", type=_number, metavar="M", help=f"metres per count (default: {DEFAULT_DEPTH_SCALE:g})")
     wire = parser.add_argument_group("options of the request")
     add = wire.add_argument
     vector = ("X", "Y", "Z")
@@ -242,4 +245,10 @@ def _parser() -> argparse.ArgumentParser:
 
 
 if __name__ == "__main__":
-    sys.exit(main())
+    try:
+        code = main()
+        sys.stdout.flush()
+    except BrokenPipeError:  # whoever reads the table, `head` for instance, has had enough
+        os.dup2(os.open(os.devnull, os.O_WRONLY), sys.stdout.fileno())  # or the interpreter's last flush fails again
+        code = 128 + signal.SIGPIPE
+    sys.exit(code)

@@ -8,6 +8,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from types import MappingProxyType
@@ -20,10 +21,14 @@ from numpy.typing import ArrayLike, NDArray
 from client.errors import InvalidArgument
 from client.form import File, encode_form
 from client.images import depth_counts, mask_levels, png
+from service.schemas import REQUEST_ID
 from tesnet.geometry import CameraIntrinsics, Pose
 
 if TYPE_CHECKING:
     from tesnet.geometry import FrameConvention
+
+DEFAULT_DEPTH_SCALE = 0.001
+"""Metres per count of a depth image."""
 
 LONGEST_QUERY = 4000
 """Characters of a query string; servers and proxies on the way refuse longer ones, some from 8,000 on."""
@@ -184,7 +189,7 @@ def depth_request(
     *,
     mask: ArrayLike | bytes | None = None,
     T_cloud_camera: Pose | ArrayLike | None = None,
-    depth_scale: float = 0.001,
+    depth_scale: float = DEFAULT_DEPTH_SCALE,
     request_id: str | None = None,
 ) -> Request:
     """The request for grasps of a depth image; see `GraspClient.grasps_from_depth`.
@@ -300,7 +305,11 @@ def _plain(name: str, value: Any) -> Any:
 def _headers(request_id: str | None) -> dict[str, str]:
     headers = {"Accept": "application/json"}
     if request_id is not None:
-        headers["X-Request-ID"] = header_value("request_id", request_id)
+        if not re.fullmatch(REQUEST_ID, request_id):
+            raise InvalidArgument(
+                "request_id", f"is {request_id[:140]!r}; give 1 to 128 letters, digits and . _ : / + = -"
+            )
+        headers["X-Request-ID"] = request_id
     return headers
 
 

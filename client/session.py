@@ -29,7 +29,15 @@ from client.conversation import (
 )
 from client.errors import InvalidArgument
 from client.reply import Answer, GraspReply, ModelReply, grasp_reply, model_reply
-from client.request import GraspOptions, Intrinsics, Request, depth_request, header_value, points_request
+from client.request import (
+    DEFAULT_DEPTH_SCALE,
+    GraspOptions,
+    Intrinsics,
+    Request,
+    depth_request,
+    header_value,
+    points_request,
+)
 from client.retry import RetryPolicy
 
 if TYPE_CHECKING:
@@ -162,7 +170,7 @@ class GraspClient(_Plans):
         intrinsics: Intrinsics | CameraIntrinsics,
         mask: ArrayLike | bytes | None = None,
         T_cloud_camera: Pose | ArrayLike | None = None,
-        depth_scale: float = 0.001,
+        depth_scale: float = DEFAULT_DEPTH_SCALE,
         request_id: str | None = None,
         timeout: float | None = None,
         **options: Unpack[GraspOptions],
@@ -273,7 +281,7 @@ class AsyncGraspClient(_Plans):
         intrinsics: Intrinsics | CameraIntrinsics,
         mask: ArrayLike | bytes | None = None,
         T_cloud_camera: Pose | ArrayLike | None = None,
-        depth_scale: float = 0.001,
+        depth_scale: float = DEFAULT_DEPTH_SCALE,
         request_id: str | None = None,
         timeout: float | None = None,
         **options: Unpack[GraspOptions],

@@ -12,6 +12,9 @@ from starlette.types import ASGIApp, Receive, Scope, Send
 from service.errors import Unauthorized, problem_response
 from service.viewer import PAGE_PATHS
 
+DOCS_FILES = "/docs/static"
+"""Where the parts of the page `/docs` lie."""
+
 OPEN_PATHS = PAGE_PATHS | {
     "/health/live",
     "/health/ready",
@@ -19,6 +22,9 @@ OPEN_PATHS = PAGE_PATHS | {
     "/v2/health/ready",
     "/docs",
     "/docs/oauth2-redirect",
+    f"{DOCS_FILES}/swagger-ui-bundle.js",
+    f"{DOCS_FILES}/swagger-ui.css",
+    f"{DOCS_FILES}/favicon.png",
     "/openapi.json",
 }
 """Answered without a key: what an orchestrator probes, the documentation and the viewer, which hold no secret."""

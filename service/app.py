@@ -8,19 +8,20 @@ from contextlib import asynccontextmanager
 import anyio.to_thread
 import msgspec
 from fastapi import FastAPI, Request, Response
+from fastapi_offline import FastAPIOffline
 from prometheus_client import CONTENT_TYPE_LATEST
 from starlette.exceptions import HTTPException
 from starlette.middleware.cors import CORSMiddleware
 
 from service import schemas
-from service.access import AccessMiddleware
+from service.access import DOCS_FILES, OPEN_PATHS, AccessMiddleware
 from service.batching import PredictionWorker, PredictorFactory
 from service.errors import NotReady, ServiceError, Unauthorized, problem_response
 from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
 from service.inference_protocol import inference_protocol
 from service.metrics import Metrics
 from service.middleware import RequestMiddleware
-from service.openapi import document_grasps, problems
+from service.openapi import document_grasps, document_keys, problems
 from service.payloads import CONTENT_TYPES
 from service.settings import Settings, service_version
 from service.viewer import viewer
@@ -63,12 +64,13 @@ def create_app(
         yield
         await anyio.to_thread.run_sync(endpoint.close, STOP_SECONDS)
 
-    app = FastAPI(
+    app = FastAPIOffline(  # its reference page loads nothing from elsewhere
         title="TES-Net grasp service",
         version=service_version(),
         description=DESCRIPTION,
         lifespan=lifespan,
         redoc_url=None,
+        static_url=DOCS_FILES,
         redirect_slashes=False,
     )
     app.state.endpoint = endpoint
@@ -100,11 +102,13 @@ def create_app(
     async def grasps(request: Request) -> Response:
         return await endpoint.answer(request, endpoint.reader)
 
+    @app.head("/health/live", include_in_schema=False)
     @app.get("/health/live", tags=["health"], summary="Does the process work?", responses=problems(NotReady))
     async def live() -> schemas.Health:
         worker.check_live()
         return schemas.Health(status="live")
 
+    @app.head("/health/ready", include_in_schema=False)
     @app.get("/health/ready", tags=["health"], summary="Does the service take requests?", responses=problems(NotReady))
     async def ready() -> schemas.Health:
         endpoint.check_ready()
@@ -129,6 +133,8 @@ def create_app(
     app.include_router(inference_protocol(settings, worker, endpoint))
     app.include_router(viewer(endpoint))
     document_grasps(app)
+    if settings.api_keys:
+        document_keys(app, OPEN_PATHS)
     return app
 
 

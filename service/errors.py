@@ -188,7 +188,7 @@ def problem_response(error: Exception, scope: Scope) -> Response:
         detail=detail,
         request_id=scope["state"]["record"].request_id,
         field=field,
-        error=detail if scope["path"].startswith(f"{INFERENCE_PROTOCOL}/") else None,
+        error=detail if f"{scope['path']}/".startswith(f"{INFERENCE_PROTOCOL}/") else None,
     )
     body = msgspec.json.encode(problem.model_dump(exclude_none=True))
     return Response(body, row.status, headers, media_type=PROBLEM_JSON)

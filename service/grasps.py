@@ -56,10 +56,11 @@ Writer = Callable[[GraspResult, Mapping[str, float]], Response]
 
 @dataclass(frozen=True, eq=False, slots=True)
 class Asked:
-    """A decoded body: the query, and what writes its answer."""
+    """A decoded body: the query, what writes its answer, and in how many seconds it must have been begun."""
 
     query: GraspQuery
     write: Writer
+    timeout: float = math.inf
 
 
 Reader = Callable[[bytearray], Asked]
@@ -171,7 +172,7 @@ class GraspEndpoint:
         decoded = time.perf_counter()
         query = asked.query
         record.fields["points"] = len(query.points)
-        answer = await self._predict(request, query, deadline)
+        answer = await self._predict(request, query, min(deadline, record.arrived + asked.timeout))
         result = answer.result
         predicted = time.perf_counter()
         timings = {
@@ -263,8 +264,8 @@ class GraspEndpoint:
 
 def refuse_compressed(request: Request) -> None:
     """Raise `UnknownContentType` for a body that would have to be expanded."""
-    encoding = request.headers.get("content-encoding", "identity").strip().lower()
-    if encoding != "identity":
+    encoding = request.headers.get("content-encoding", "").strip().lower()
+    if encoding not in ("", "identity"):
         raise UnknownContentType(
             f"Content-Encoding {shortened(encoding)} is not supported; send the body uncompressed."
         )

@@ -61,6 +61,10 @@ OUTPUTS = [
 
 _FIELDS = ("id", "parameters", "inputs", "outputs")
 _BINARY_OUTPUT = "binary_data_output"
+_TIMEOUT = "timeout"
+"""Microseconds that a request may wait for its turn: Triton's extension for schedulers."""
+_UNSUPPORTED = ("priority", "sequence_id", "sequence_start", "sequence_end")
+"""What else Triton's clients can send for its schedulers."""
 _MAX_FIELD_BYTES = 65_536
 """JSON text of `id` and of `outputs`."""
 _CHUNK = 1 << 17
@@ -76,7 +80,7 @@ class _Input(msgspec.Struct, forbid_unknown_fields=True):
     shape: tuple[int, int]
     datatype: str
     data: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
-    parameters: _InputParameters = msgspec.field(default_factory=_InputParameters)
+    parameters: _InputParameters | None = None
 
 
 class _OutputParameters(msgspec.Struct, forbid_unknown_fields=True):
@@ -85,11 +89,11 @@ class _OutputParameters(msgspec.Struct, forbid_unknown_fields=True):
 
 class _Output(msgspec.Struct, forbid_unknown_fields=True):
     name: str
-    parameters: _OutputParameters = msgspec.field(default_factory=_OutputParameters)
+    parameters: _OutputParameters | None = None
 
 
 _REQUEST = raw_object(_FIELDS)
-_PARAMETERS = raw_object((*GraspOptions.model_fields, _BINARY_OUTPUT))
+_PARAMETERS = raw_object((*GraspOptions.model_fields, _BINARY_OUTPUT, _TIMEOUT, *_UNSUPPORTED))
 _NUMBERS = msgspec.json.Decoder(list[float])
 
 
@@ -168,11 +172,13 @@ def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: G
     async def server() -> schemas.ServerMetadata:
         return schemas.ServerMetadata(name="tes-net", version=service_version(), extensions=["binary_tensor_data"])
 
+    @router.head("/health/live", include_in_schema=False)
     @router.get("/health/live", summary="Does the process work?", responses=problems(NotReady))
     async def live() -> dict[str, bool]:
         worker.check_live()
         return {"live": True}
 
+    @router.head("/health/ready", include_in_schema=False)
     @router.get("/health/ready", summary="Does the service take requests?", responses=problems(NotReady))
     async def ready() -> dict[str, bool]:
         endpoint.check_ready()
@@ -222,6 +228,8 @@ def _version_of_path(version: str) -> str:
 
 def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> Reader:
     refuse_compressed(request)
+    if request.scope["query_string"]:
+        raise Invalid("query string", "has no meaning here; options go into `parameters` of the body")
     head_length = request.headers.get(HEADER_LENGTH)
     if head_length is not None and not re.fullmatch(r"\d{1,10}", head_length):
         raise Invalid(HEADER_LENGTH, f"is {shortened(head_length)}; give the bytes of the JSON at the body's beginning")
@@ -237,6 +245,7 @@ def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> R
         all_binary = parameters.pop(_BINARY_OUTPUT, b"false")
         if all_binary not in (b"true", b"false"):
             raise Invalid(_BINARY_OUTPUT, f"is {shortened(all_binary.decode())}; give true or false")
+        timeout = _timeout(parameters.pop(_TIMEOUT, None))
         outputs = _outputs(fields.get("outputs"), all_binary == b"true")
         identity = _bounded(fields.get("id", memoryview(b'""')), "id", str)
         points = _points(fields.get("inputs"), memoryview(body)[head:], settings.max_points)
@@ -249,7 +258,7 @@ def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> R
             head = {"model_name": worker.model.name, "model_version": worker.model.version}
             return _response(head | ({"id": identity} if identity else {}), arrays, meta, outputs)
 
-        return Asked(build_query(Payload(points), options), write)
+        return Asked(build_query(Payload(points), options), write, timeout)
 
     return read
 
@@ -257,7 +266,7 @@ def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> R
 def _fields(head: bytes) -> dict[str, memoryview]:
     """The JSON text of each field of an inference request."""
     try:
-        return raw_values(_REQUEST.decode(head))
+        return _given(raw_values(_REQUEST.decode(head)))
     except msgspec.ValidationError as error:
         raise Invalid("body", f"is no inference request ({shortened(str(error))}); fields: {_FIELDS}") from None
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
@@ -267,17 +276,38 @@ def _fields(head: bytes) -> dict[str, memoryview]:
         ) from None
 
 
+def _given(values: Mapping[str, memoryview]) -> dict[str, memoryview]:
+    """The values but for nulls, which are as good as left out."""
+    return {name: text for name, text in values.items() if bytes(text[:5]) != b"null"}
+
+
 def _parameters(text: memoryview) -> dict[str, bytes]:
     """Options, and `binary_data_output`, as JSON text."""
     try:
-        values = raw_values(_PARAMETERS.decode(text))
+        values = _given(raw_values(_PARAMETERS.decode(text)))
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise object_error(bytes(text), error, '{"max_grasps": 5, ...}', "parameters") from None
+    for name in values:
+        if name in _UNSUPPORTED:
+            raise Invalid(name, "is not supported: requests are answered in the order in which they come; leave it out")
     texts = option_texts(values)
     return {
         name: json_text(name, msgspec.json.decode(value, type=str).encode()) if value[:1] == b'"' else value
         for name, value in texts.items()
     }
+
+
+def _timeout(text: bytes | None) -> float:
+    """Seconds that the request may wait for its turn; 0 is no limit, as in Triton.
+
+    Raises:
+        Invalid: not a whole number of microseconds.
+    """
+    if text is None:
+        return math.inf
+    if not re.fullmatch(rb"\d{1,12}", text):
+        raise Invalid(_TIMEOUT, f"is {shortened(text[:400].decode())}; give whole microseconds, at most {10**12 - 1}")
+    return int(text) / 1e6 or math.inf
 
 
 def _bounded(text: memoryview, name: str, kind: Any) -> Any:
@@ -303,7 +333,7 @@ def _outputs(text: memoryview | None, all_binary: bool) -> dict[str, bool]:
             raise Invalid("outputs", f"name {shortened(output.name)}, which there is not; valid: {', '.join(known)}")
     if not asked:
         return dict.fromkeys(known, all_binary)
-    chosen = {output.name: output.parameters.binary_data for output in asked}
+    chosen = {output.name: output.parameters.binary_data if output.parameters else None for output in asked}
     return {name: all_binary if binary is None else binary for name, binary in chosen.items()}
 
 
@@ -324,7 +354,7 @@ def _points(text: memoryview | None, tail: memoryview, max_points: int) -> Point
     if count < 0 or width != 3:
         raise Invalid("inputs", f"have shape [{count}, {width}]; give [N, 3]")
     check_count(count, max_points)
-    size = given.parameters.binary_data_size
+    size = given.parameters.binary_data_size if given.parameters else None
     if (size is None) == (given.data is msgspec.UNSET):
         raise Invalid("inputs", "need either data or the parameter binary_data_size")
     if size is not None:

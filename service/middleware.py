@@ -16,6 +16,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
 from service.errors import NotReady, problem_response
 from service.metrics import Metrics
+from service.schemas import REQUEST_ID
 
 log = logging.getLogger("service.request")
 
@@ -119,7 +120,7 @@ class RequestMiddleware:
 
 def request_id_of(given: str | None) -> str:
     """The client's id where it is fit for a log (up to 128 letters, digits and . _ : / + = -), else a fresh one."""
-    if given and re.fullmatch(r"[A-Za-z0-9._:/+=-]{1,128}", given):
+    if given and re.fullmatch(REQUEST_ID, given):
         return given
     return uuid.uuid4().hex
 

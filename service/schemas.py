@@ -16,6 +16,9 @@ from tesnet.geometry import PANDA, FrameConvention
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS
 from tesnet.result import Reason
 
+REQUEST_ID = r"[A-Za-z0-9._:/+=-]{1,128}"
+"""What a client may call its request in X-Request-ID; a request that comes with anything else is given a name."""
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 MatrixRow = tuple[float, float, float, float]
@@ -56,7 +59,7 @@ class Target(RequestPart):
     indices: Sequence[Annotated[int, Field(ge=0, lt=2**31)]] | None = Field(
         default=None,
         description="Numbers of the target's points, from 0: rows of the posted cloud, or pixels of a depth image row "
-        "by row.",
+        "by row. Mark all points of the object: a cell of the voxel grid is the target's where half of its points are.",
     )
 
     @model_validator(mode="after")

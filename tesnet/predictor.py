@@ -136,13 +136,14 @@ class GraspPredictor:
         prepared = cloud.prepare(query, self._preparation, self.device)
         self._synchronise()
         clock.lap("prepare")
+        if prepared is not None:
+            notes += _cloud_warnings(prepared, self._preparation)
         if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
             count = 0 if prepared is None else len(prepared)
             outside = prepared is None and len(query.points) > 0
             reason: Reason = "no_points_in_workspace" if outside else "too_few_points"
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
-        notes += _cloud_warnings(prepared, self._preparation)
-        notes += _target_warnings(prepared)
+        notes += _target_warnings(prepared, query, self._preparation)
 
         found = self._search(prepared, query)
         self._synchronise()
@@ -330,10 +331,16 @@ def _query_warnings(query: GraspQuery) -> list[str]:
     return notes
 
 
-def _target_warnings(prepared: cloud.PreparedCloud) -> list[str]:
+def _target_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
     if prepared.on_target is None or bool(prepared.on_target.any()):
         return []
-    return ["target holds none of the points that are left after crop and voxel grid: nothing can be grasped there"]
+    if query.target is None or isinstance(query.target, Box):
+        return ["target holds none of the points that are left after the crop: nothing can be grasped there"]
+    note = (
+        f"target has {int(query.target.sum())} points, but no {config.voxel_size * 1000:g} mm cell that is left after "
+        "the crop has as many of them as of others: mark all points of the object, or give a box"
+    )
+    return [note]
 
 
 def _cloud_warnings(prepared: cloud.PreparedCloud, config: cloud.PreparationConfig) -> list[str]:

@@ -59,7 +59,7 @@ class Recipe:
 PRESETS = {
     "default": Recipe(),
     # For weights that are good already (`start`), on many more views than they saw.
-    "refine": Recipe(learning_rate=1.2e-3, weight_decay=0.02, max_epochs=5),
+    "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=3),
     # Section 5.1: Adam, the rate halved after 6 stagnant epochs; the rate itself is Edge Grasp Network's.
     "paper": Recipe(
         optimiser="adam", learning_rate=1e-4, weight_decay=0.0, patience=6, smallest_learning_rate=1e-6,

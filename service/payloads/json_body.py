@@ -54,7 +54,7 @@ def object_error(body: bytes | bytearray, error: Exception, expected: str, name:
         return Invalid(
             "points", f"hold NaN or an infinity (at byte {position[1]}), which JSON does not know; remove such points"
         )
-    return Undecodable(f"The JSON cannot be read: {shortened(message)}.")
+    return Undecodable(f"The JSON of the {name} cannot be read: {shortened(message)}.")
 
 
 _CHUNK = 1 << 17

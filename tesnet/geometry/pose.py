@@ -62,7 +62,8 @@ class Pose:
         if deviation > _ORTHONORMAL_TOLERANCE or np.linalg.det(self.rotation) < 0:
             raise ValueError(
                 f"rotation is no rotation matrix: R R^T differs from the identity by {deviation:.2e} "
-                f"(limit {_ORTHONORMAL_TOLERANCE:g}), determinant {np.linalg.det(self.rotation):.3f} (must be +1)"
+                f"(limit {_ORTHONORMAL_TOLERANCE:g}), determinant {np.linalg.det(self.rotation):.3f} (must be +1); "
+                "give its numbers with 6 decimals or more"
             )
 
     # Factories

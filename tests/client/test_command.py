@@ -3,6 +3,7 @@ from __future__ import annotations
 import io
 import json
 import os
+import signal
 import subprocess
 import sys
 from collections.abc import Callable, Sequence
@@ -54,6 +55,19 @@ def test_a_ply_file_becomes_an_aligned_table(
         np.testing.assert_allclose(row, expected, atol=1e-3)
     assert done.stderr.decode() == "warning: `up` is missing.\n"
     np.testing.assert_array_equal(np.frombuffer(server.received[0].body, "<f4").reshape(-1, 3), points)
+
+
+def test_a_reader_that_has_had_enough_leaves_no_traceback(
+    server: ScriptedServer, cloud: str, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    command = [sys.executable, "-m", "client", cloud, "--url", server.url]
+    with subprocess.Popen(command, cwd=ROOT, stdout=subprocess.PIPE, stderr=subprocess.PIPE) as asking:
+        assert asking.stdout is not None
+        assert asking.stderr is not None
+        asking.stdout.close()
+        assert b"Traceback" not in asking.stderr.read()
+    assert asking.returncode == 128 + signal.SIGPIPE
 
 
 def test_json_is_the_service_s_document_and_the_url_may_come_from_the_environment(
@@ -132,6 +146,7 @@ def test_flags_left_out_stay_the_service_s_defaults(server: ScriptedServer, clou
         ["c.ply", "--gripper", "0.06"],
         ["c.ply", "--gripper", "max_width=wide"],
         ["c.ply", "--mask", "mask.png"],
+        ["c.ply", "--depth-scale", "0.001"],
         ["absent.png", "--intrinsics", "1", "1", "0", "0"],
     ],
 )

@@ -10,7 +10,7 @@ import httpx
 import numpy as np
 import pytest
 
-from service.access import OPEN_PATHS
+from service.access import DOCS_FILES, OPEN_PATHS
 from service.app import create_app
 from service.settings import load_settings
 from service.viewer import PAGE_PATHS
@@ -59,12 +59,25 @@ def test_a_key_opens_and_nothing_else_does(guarded: str) -> None:
 
 def test_every_other_route_needs_a_key_too(guarded: str) -> None:
     app = create_app(load_settings({}), lambda: pytest.fail("is not started"))
-    pages = {"/docs", "/docs/oauth2-redirect", "/openapi.json", "/viewer/points"} | PAGE_PATHS
+    static = {f"{DOCS_FILES}/{name}" for name in ("swagger-ui-bundle.js", "swagger-ui.css", "favicon.png")}
+    pages = {"/docs", "/docs/oauth2-redirect", "/openapi.json", "/viewer/points"} | PAGE_PATHS | static
     paths = pages | {re.sub(r"\{\w+\}", "tesnet", path) for path in app.openapi()["paths"]}
     assert paths >= OPEN_PATHS
     for path in paths:
         status = httpx.get(f"{guarded}{path}").status_code
         assert (status == 200) if path in OPEN_PATHS else (status == 401), path
+
+
+def test_the_reference_tells_how_a_key_is_given() -> None:
+    open_document = create_app(load_settings({}), lambda: pytest.fail("is not started")).openapi()
+    assert "security" not in open_document
+    app = create_app(load_settings({"GRASP_API_KEYS": "k"}), lambda: pytest.fail("is not started"))
+    document = app.openapi()
+    assert [list(way) for way in document["security"]] == [["bearer"], ["key"]]
+    assert set(document["components"]["securitySchemes"]) == {"bearer", "key"}
+    for path, operations in document["paths"].items():
+        for operation in operations.values():
+            assert (operation.get("security") == []) == (path in OPEN_PATHS), path
 
 
 def test_browsers_are_not_let_in_unless_configured(serve: Serve, guarded: str) -> None:

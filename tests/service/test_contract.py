@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import urllib.parse
 from typing import Any
 
@@ -243,8 +244,18 @@ def test_health_and_metrics(http: httpx.Client, cloud: NDArray[np.float32]) -> N
         assert line in text
 
 
+@pytest.mark.parametrize("path", ["/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"])
+def test_probes_may_ask_for_the_head_alone(http: httpx.Client, path: str) -> None:
+    answer = http.head(path)
+    assert (answer.status_code, answer.content) == (200, b"")
+
+
 def test_the_documentation_covers_bodies_options_and_problems(http: httpx.Client) -> None:
-    assert "swagger" in http.get("/docs").text.lower()
+    page = http.get("/docs").text
+    loaded = re.findall(r'(?:src|href)="([^"]+)"', page)
+    assert any("swagger" in address for address in loaded)
+    for address in loaded:  # from this service, so that the page works where there is no other network
+        assert http.get(address).status_code == 200, address
     document = http.get("/openapi.json").json()
     post = document["paths"]["/grasps"]["post"]
     assert set(post["requestBody"]["content"]) == {

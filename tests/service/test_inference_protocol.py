@@ -153,6 +153,9 @@ BAD: dict[str, tuple[Any, int, str]] = {
     "a class count": (body(outputs=[{"name": "scores", "parameters": {"classification": 1}}]), 422, "classification"),
     "many outputs": (body(outputs=[{"name": "scores"}] * 9999), 422, "65536"),
     "a number for an id": (body(id=1), 422, "id"),
+    "a priority": (body(parameters={"priority": 1}), 422, "order"),
+    "a sequence": (body(parameters={"sequence_id": 3, "sequence_start": True}), 422, "sequence_"),
+    "a timeout in seconds": (body(parameters={"timeout": 0.5}), 422, "microseconds"),
     "an unknown option": (body(parameters={"max_graps": 1}), 422, "max_grasps"),
     "an option out of range": (body(parameters={"max_grasps": "0"}), 422, "max_grasps"),
     "another network": (body(parameters={"model": "gpd"}), 422, "gpd"),
@@ -172,6 +175,33 @@ def test_a_bad_request_is_a_problem_whose_detail_is_also_the_error(http: httpx.C
     assert word in problem["detail"]
     assert problem["error"] == problem["detail"]
     assert len(answer.text) < 2000
+
+
+def test_null_is_as_good_as_left_out(http: httpx.Client) -> None:
+    inputs = [{**body()["inputs"][0], "parameters": None}]
+    given = {"inputs": inputs, "id": None, "parameters": {"up": None, "timeout": None}, "outputs": None}
+    answer = http.post(INFER, json=given)
+    assert answer.status_code == 200, answer.text
+    assert "id" not in answer.json()
+    again = http.post(INFER, json={**given, "parameters": None, "outputs": [{"name": "scores", "parameters": None}]})
+    assert [output["name"] for output in again.json()["outputs"]] == ["scores"]
+
+
+def test_options_in_the_query_string_are_refused(http: httpx.Client) -> None:
+    answer = http.post(f"{INFER}?max_grasps=1", json=body())
+    assert (answer.status_code, "parameters" in answer.json()["error"]) == (422, True)
+
+
+def test_tritons_timeout_is_how_long_a_request_may_wait(client: triton.InferenceServerClient, cloud: Cloud) -> None:
+    points = [tensor(cloud, binary=True)]
+    assert client.infer("tesnet", points, timeout=60_000_000).as_numpy("scores") is not None
+    with pytest.raises(InferenceServerException, match="deadline") as late:
+        client.infer("tesnet", points, timeout=1)
+    assert late.value.status() == "504"
+
+
+def test_the_root_has_the_error_too(http: httpx.Client) -> None:
+    assert http.post("/v2").json()["error"].startswith("This path does not take this method")
 
 
 def test_requests_are_counted_under_the_route_and_not_under_what_the_client_names(http: httpx.Client) -> None:

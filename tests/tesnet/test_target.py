@@ -70,13 +70,20 @@ def test_everything_as_a_target_changes_nothing() -> None:
     assert masked.counts.rejected == without.counts.rejected
 
 
-@pytest.mark.parametrize("target", [np.zeros(40_000, dtype=bool), Box(np.full(3, 5.0), np.full(3, 6.0), "target")])
-def test_a_target_without_points_has_no_candidates_and_a_warning(target: Any) -> None:
+@pytest.mark.parametrize(
+    ("target", "says"),
+    [
+        (np.zeros(40_000, dtype=bool), "target has 0 points"),
+        (np.arange(40_000) == 700, "target has 1 points"),
+        (Box(np.full(3, 5.0), np.full(3, 6.0), "target"), "target holds none"),
+    ],
+)
+def test_a_target_without_cells_has_no_candidates_and_a_warning(target: Any, says: str) -> None:
     points = tabletop(0)
     target = target[: len(points)] if isinstance(target, np.ndarray) else target
     found = fresh_predictor().predict(tabletop_query(target=target))
     assert (len(found.grasps), found.reason) == (0, "no_candidates")
-    assert any(note.startswith("target holds none") for note in found.warnings)
+    assert any(note.startswith(says) for note in found.warnings)
 
 
 def test_a_cloud_that_is_too_large_is_cut_around_the_target() -> None:
