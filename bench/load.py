@@ -2,7 +2,8 @@
 
 First its capacity is measured with as many requests in flight as it takes to keep it busy. Then requests arrive at
 random moments (a Poisson process, seeded) at half, once, twice and ten times that rate, whether answers come or not,
-while `GET /health/live` is asked twenty times a second from a thread of its own.
+while `GET /health/live` is asked twenty times a second from a thread of its own. What sends shares the machine with the
+service; the last column tells how much of it that took.
 """
 
 from __future__ import annotations
@@ -13,9 +14,10 @@ import http.client
 import threading
 import time
 from collections import Counter
-from collections.abc import Iterator
+from collections.abc import Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
+from typing import Any
 from urllib.parse import quote
 
 import httpx
@@ -42,6 +44,7 @@ class Outcome:
         statuses: how many answers of each status; 0 is a connection that failed.
         accepted_ms, rejected_ms: from sending to the answer's last byte, of 200s and of 429s and 503s.
         health_ms: of `GET /health/live`.
+        sender_cores: cores that sending kept busy.
     """
 
     seconds: float = 0.0
@@ -49,6 +52,7 @@ class Outcome:
     accepted_ms: list[float] = field(default_factory=list)
     rejected_ms: list[float] = field(default_factory=list)
     health_ms: list[float] = field(default_factory=list)
+    sender_cores: float = 0.0
 
     @property
     def throughput(self) -> float:
@@ -134,6 +138,16 @@ class Load:
             outcome.rejected_ms.append(taken)
 
 
+def measured(url: str, sending: Coroutine[Any, Any, Outcome]) -> Outcome:
+    """The outcome of sending, with what was seen meanwhile."""
+    cpu = time.process_time()
+    with probing(url) as health:
+        outcome = asyncio.run(sending)
+    outcome.health_ms = health
+    outcome.sender_cores = (time.process_time() - cpu) / outcome.seconds
+    return outcome
+
+
 @contextmanager
 def probing(url: str) -> Iterator[list[float]]:
     """Milliseconds of `GET /health/live`, asked in a thread for as long as the context lasts."""
@@ -170,7 +184,7 @@ def row(name: str, offered: float, outcome: Outcome) -> str:
         f"{name:>9}  {offered:9.2f}  {outcome.throughput:9.2f}  {outcome.share(200):6.1f}  "
         f"{outcome.share(429, 503):8.1f}  {outcome.share(504):6.1f}  {abs(other):6.1f}  "
         f"{percentiles(outcome.accepted_ms):>18}  {percentiles(outcome.rejected_ms):>14}  "
-        f"{percentiles(outcome.health_ms):>12}"
+        f"{percentiles(outcome.health_ms):>12}  {outcome.sender_cores:6.2f}"
     )
 
 
@@ -197,21 +211,17 @@ def main() -> None:
     )
     print(
         f"{'load':>9}  {'offered/s':>9}  {'answers/s':>9}  {'200 %':>6}  {'429+503':>8}  {'504 %':>6}  {'else %':>6}  "
-        f"{'200: p50/95/99 ms':>18}  {'refusal: ms':>14}  {'health: ms':>12}"
+        f"{'200: p50/95/99 ms':>18}  {'refusal: ms':>14}  {'health: ms':>12}  {'sender':>6}"
     )
     with running_service(port, arguments.threads, **settings) as process, GraspClient(url) as client:
         client.wait_until_ready(120)
         load = Load(url, arguments.points, arguments.candidates, arguments.timeout)
         asyncio.run(load.closed(min(5.0, arguments.seconds)))  # not measured: what is slow the first time
-        with probing(url) as health:
-            outcome = asyncio.run(load.closed(arguments.seconds))
-        outcome.health_ms = health
+        outcome = measured(url, load.closed(arguments.seconds))
         capacity = outcome.throughput
         print(row("capacity", capacity, outcome), flush=True)
         for factor in FACTORS:
-            with probing(url) as health:
-                outcome = asyncio.run(load.open(factor * capacity, arguments.seconds, arguments.seed))
-            outcome.health_ms = health
+            outcome = measured(url, load.open(factor * capacity, arguments.seconds, arguments.seed))
             print(row(f"{factor:g} x", factor * capacity, outcome), flush=True)
         print(f"\nmemory at its highest: {memory_mb(process.pid, 'VmHWM'):.0f} MB resident")
 

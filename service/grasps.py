@@ -157,6 +157,12 @@ class GraspEndpoint:
             with anyio.fail_after(max(0.0, deadline - time.perf_counter())):
                 yield deadline
         except TimeoutError:
+            record = request.state.record
+            if not record.body_complete:
+                raise DeadlineExceeded(
+                    f"Only {record.bytes_in} bytes of the body had come after {timeout:g} s; send it faster, or set a "
+                    f"larger X-Request-Timeout (at most {MAX_TIMEOUT_S:g})."
+                ) from None
             raise DeadlineExceeded(
                 f"No answer within {timeout:g} s; send fewer points, lower max_candidates, or set a larger "
                 f"X-Request-Timeout (at most {MAX_TIMEOUT_S:g})."
