@@ -67,8 +67,8 @@ def measure(
     Args:
         scored: logits and outcomes, a pair a view.
         seed: of the subsampling.
-        calibration: (a, b) of the served score. When not given, it is fitted to every other view, and its error is
-            that on the remaining ones.
+        calibration: (a, b) of the served score. When not given, it is fitted to every other view, and the served
+            score's error and loss are those on the remaining ones.
     """
     usable = [view for view in scored if metrics.usable(view[1])]
     if not usable:
@@ -80,7 +80,7 @@ def measure(
     judged = scored if calibration or len(scored) == 1 else scored[1::2]
     a, b = calibration or metrics.fit_calibration(*_joined(scored[::2]))
     judged_logits, judged_success = _joined(judged)
-    probabilities = 1 / (1 + np.exp(-(a * judged_logits + b)))
+    served = a * judged_logits + b
     return {
         "views": len(scored),
         "usable_views": len(usable),
@@ -92,7 +92,8 @@ def measure(
         "auroc": metrics.auroc(logits, success),
         "average_precision": metrics.average_precision(logits, success),
         "calibration": [a, b],
-        "calibration_error": metrics.calibration_error(probabilities, judged_success),
+        "calibration_error": metrics.calibration_error(1 / (1 + np.exp(-served)), judged_success),
+        "served_loss": metrics.cross_entropy(served, judged_success),
         "top1": float(np.mean([view[1][view[0].argmax()] for view in scored])),
     }
 

@@ -59,7 +59,7 @@ class Recipe:
 PRESETS = {
     "default": Recipe(),
     # For weights that are good already (`start`), on many more views than they saw.
-    "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=3),
+    "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=4),
     # Section 5.1: Adam, the rate halved after 6 stagnant epochs; the rate itself is Edge Grasp Network's.
     "paper": Recipe(
         optimiser="adam", learning_rate=1e-4, weight_decay=0.0, patience=6, smallest_learning_rate=1e-6,
@@ -95,8 +95,11 @@ def fit(
 ) -> dict[str, Any]:
     """Trains network `name`, writes its best weights to `out` and returns its validation measures.
 
-    Most candidates that the network is asked about are free of collision with the observed cloud, as in the service;
-    the classes are weighted to be balanced. After every epoch a checkpoint beside `out` lets a stopped run go on.
+    Most candidates that the network is asked about are free of collision with the observed cloud, as in the service.
+    Its logit is the log likelihood ratio of success, that is, the log odds where half of all candidates succeed: in the
+    loss the log odds of the labels' own share of successes are added to it (logit adjustment, arXiv 2007.07314). Which
+    kind of candidate is shown more often does not bend it. After every epoch a checkpoint beside `out` lets a stopped
+    run go on.
 
     Args:
         name: of the network.
@@ -125,7 +128,7 @@ def fit(
         )
     validation_views = list(load_views(validation))
     labels = sum(len(view.outcomes) for view in train_views)
-    prior = _share_of_successes(train_views, recipe)
+    prior = sum(int(view.success.sum()) for view in train_views) / labels
     network = networks.build(name)
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
@@ -143,9 +146,9 @@ def fit(
         started = time.monotonic()
         loss = _epoch(network, optimiser, recipe, train_views, prior, progress, seed)
         measures = measure(score_views(network, validation_views), seed)
-        _schedule(recipe, progress, measures["balanced_loss"])
-        if measures["balanced_loss"] <= progress.best_loss:
-            progress.best_loss = measures["balanced_loss"]
+        _schedule(recipe, progress, measures["served_loss"])
+        if measures["served_loss"] <= progress.best_loss:
+            progress.best_loss = measures["served_loss"]
             training = {
                 "data": {"scenes": len(scene_files(data)), "views": len(train_views), "labels": labels, "prior": prior},
                 "recipe": asdict(recipe), "seed": seed, "epoch": progress.epoch, "validation": measures,
@@ -160,21 +163,6 @@ def fit(
                                   "seconds": time.monotonic() - started}) + "\n")  # fmt: skip
     _, header = weights.load(out)
     return dict(header.training or {})
-
-
-def _share_of_successes(views: Sequence[LabelledView], recipe: Recipe) -> float:
-    """The share of successes among the candidates that an epoch shows, on average."""
-    shown = expected = 0.0
-    for view in views:
-        for mask, most in (
-            (view.collision_free, recipe.candidates_per_view),
-            (~view.collision_free, recipe.blocked_per_view),
-        ):
-            count = int(mask.sum())
-            part = min(1.0, most / max(1, count))
-            shown += part * count
-            expected += part * int((view.success & mask).sum())
-    return expected / shown
 
 
 def _optimiser(network: Network, recipe: Recipe) -> torch.optim.Optimizer:
@@ -196,7 +184,7 @@ def _epoch(
     rng = np.random.default_rng([seed, progress.epoch])
     order = rng.permutation(len(views))
     steps = math.ceil(len(views) / recipe.views_per_step)
-    class_weights = torch.tensor([0.5 / (1 - prior), 0.5 / prior])
+    log_odds = math.log(prior / (1 - prior))
     total = 0.0
     network.train()
     bar = tqdm(range(steps), desc=f"epoch {progress.epoch}", mininterval=10)
@@ -209,7 +197,7 @@ def _epoch(
             group["lr"] = progress.learning_rate
         optimiser.zero_grad()
         for index in order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step]:
-            loss = _view_loss(network, augment(views[index], rng), class_weights, recipe, rng)
+            loss = _view_loss(network, augment(views[index], rng), log_odds, recipe, rng)
             (loss / recipe.views_per_step).backward()
             total += float(loss.detach())
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
@@ -220,8 +208,9 @@ def _epoch(
 
 
 def _view_loss(
-    network: Network, view: LabelledView, class_weights: Tensor, recipe: Recipe, rng: np.random.Generator
+    network: Network, view: LabelledView, log_odds: float, recipe: Recipe, rng: np.random.Generator
 ) -> Tensor:
+    """Cross-entropy of the outcomes of some candidates, whose probability is sigmoid(logit + log odds of the prior)."""
     which = torch.cat(
         [
             _some(view.collision_free, recipe.candidates_per_view, rng),
@@ -231,7 +220,7 @@ def _view_loss(
     target = view.success[which]
     mirror = torch.from_numpy(rng.choice([-1.0, 1.0], len(which)).astype(np.float32))
     logits = network.score(network.encode(view.cloud), view.cloud, view.candidates.select(which), mirror)
-    return functional.binary_cross_entropy_with_logits(logits, target.float(), class_weights[target.long()])
+    return functional.binary_cross_entropy_with_logits(logits + log_odds, target.float())
 
 
 def _some(mask: Tensor, count: int, rng: np.random.Generator) -> Tensor:

@@ -77,6 +77,12 @@ def wait_for(condition: Callable[[], Any], what: str) -> Any:
     raise AssertionError(f"waited {WAIT_S:.0f} s for {what}")
 
 
+def wait_for_a_round(out: Path) -> None:
+    """Until a round is on the disk: the file appears a moment before its first line."""
+    path = out / "rounds.jsonl"
+    wait_for(lambda: path.exists() and path.read_text().endswith("\n"), "the first round")
+
+
 def lines(path: Path) -> list[dict[str, Any]]:
     return [json.loads(line) for line in path.read_text().splitlines()]
 
@@ -185,7 +191,7 @@ def test_an_attempt_is_replayed_with_the_recorded_outcome(two_rounds: Path) -> N
 def test_ctrl_c_ends_cleanly_and_leaves_no_process(start_stub: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started("--rounds", 500, "--url", start_stub("--nothing"), "--workers", 2, "--out", out) as process:
-        wait_for((out / "rounds.jsonl").exists, "the first round")
+        wait_for_a_round(out)
         os.killpg(process.pid, signal.SIGINT)  # as a terminal does
         output, errors = process.communicate(timeout=WAIT_S)
         assert process.returncode == 130
@@ -201,14 +207,14 @@ def test_ctrl_c_ends_cleanly_and_leaves_no_process(start_stub: Any, tmp_path: Pa
 def test_workers_end_when_their_parent_is_killed(start_stub: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started("--rounds", 500, "--url", start_stub("--nothing"), "--workers", 2, "--out", out) as process:
-        wait_for((out / "rounds.jsonl").exists, "the first round")
+        wait_for_a_round(out)
         process.kill()
 
 
 def test_a_worker_that_dies_is_noticed(start_stub: Any, tmp_path: Path) -> None:
     out = tmp_path / "out"
     with started("--rounds", 500, "--url", start_stub("--nothing"), "--workers", 2, "--out", out) as process:
-        wait_for((out / "rounds.jsonl").exists, "the first round")
+        wait_for_a_round(out)
         os.kill(worker_of(process.pid), signal.SIGKILL)
         _, errors = process.communicate(timeout=WAIT_S)
         assert process.returncode == 3
@@ -355,12 +361,12 @@ def test_another_port_is_tried_when_one_was_taken_meanwhile(
 
 _LISTEN_AS_THE_SERVICE = """
 import os, sys
-from service import __main__ as service
+from service import process
 from service.settings import InvalidSetting, load_settings
 try:
-    service._listen(load_settings(os.environ)).close()
+    process._listen(load_settings(os.environ)).close()
 except InvalidSetting as error:
-    sys.exit(service._fail(str(error), 2))
+    sys.exit(process._fail(str(error), 2))
 """
 
 

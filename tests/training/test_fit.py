@@ -1,8 +1,10 @@
 from __future__ import annotations
 
 import json
+import math
 from dataclasses import replace
 from pathlib import Path
+from types import SimpleNamespace
 from typing import Any
 
 import numpy as np
@@ -79,6 +81,20 @@ def test_training_begins_with_given_weights(folder: Path, tmp_path: Path) -> Non
     first, second = (weights.load(tmp_path / f"{name}.safetensors")[0] for name in ("first", "second"))
     for name, tensor in first.items():
         torch.testing.assert_close(tensor, second[name], atol=1e-6, rtol=0)
+
+
+@pytest.mark.parametrize("shown", [0.2, 0.5])
+def test_a_logit_of_zero_is_an_even_chance_at_a_balanced_prior(shown: float) -> None:
+    view = labelled_view(count=60, positives=round(60 * shown))
+    logit = torch.zeros((), requires_grad=True)
+    network = SimpleNamespace(
+        encode=lambda cloud: None, score=lambda features, cloud, candidates, mirror: logit.expand(len(candidates))
+    )
+    log_odds = math.log(shown / (1 - shown))
+    recipe = replace(RECIPE, candidates_per_view=60)
+    fitting._view_loss(network, view, log_odds, recipe, np.random.default_rng(0)).backward()  # type: ignore[arg-type]
+    assert logit.grad is not None
+    assert float(logit.grad) == pytest.approx(0, abs=1e-6)
 
 
 def test_training_learns_the_training_views(folder: Path, tmp_path: Path) -> None:
