@@ -8,6 +8,7 @@ from __future__ import annotations
 
 from dataclasses import dataclass
 
+import numpy as np
 import torch
 from torch import Tensor
 
@@ -19,6 +20,9 @@ MINIMUM_POINTS = 32
 
 SUPPORT_CLEARANCE = 0.005
 """Points lower than this above the support plane belong to it."""
+
+_LEVEL = 0.5
+"""Of a side of the workspace: cosine of its normal with `up` from which on it lies across it, as a table does."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -59,6 +63,8 @@ class PreparedCloud:
         viewpoints: (V, 3).
         up: (3,) or None.
         support_height: along `up`, in this frame, or None.
+        sides: (S, 4) unit normals, outward, and distances from the origin along them, of the planes that bound what
+            was observed sideways: those of the workspace that do not lie across `up`. None of them without `up`.
         T_cloud_canonical: back to the frame of the query.
         on_target: (P,) mask of the points that candidates may come from; None is all of them.
         dropped_far, dropped_surplus: points ignored because of `max_extent` and of `max_points`.
@@ -72,6 +78,7 @@ class PreparedCloud:
     viewpoints: Tensor
     up: Tensor | None
     support_height: float | None
+    sides: Tensor
     T_cloud_canonical: Pose
     on_target: Tensor | None = None
     dropped_far: int = 0
@@ -132,6 +139,7 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
         viewpoints=viewpoints,
         up=None if up is None else (up @ rotation).float().to(device),
         support_height=support_height,
+        sides=_sides(query, T_cloud_canonical).to(device),
         T_cloud_canonical=T_cloud_canonical,
         on_target=on_target,
         dropped_far=dropped_far,
@@ -153,6 +161,18 @@ def _inside(points: Tensor, box: Box) -> Tensor:
     low = torch.tensor(box.minimum, dtype=points.dtype, device=points.device)
     high = torch.tensor(box.maximum, dtype=points.dtype, device=points.device)
     return ((points[:, :3] >= low) & (points[:, :3] <= high)).all(dim=1)
+
+
+def _sides(query: GraspQuery, T_cloud_canonical: Pose) -> Tensor:
+    """`PreparedCloud.sides` of a query."""
+    planes = []
+    if query.workspace is not None and query.up is not None:
+        for axis in np.flatnonzero(np.abs(query.up) <= _LEVEL):
+            for sign, end in ((-1.0, query.workspace.minimum[axis]), (1.0, query.workspace.maximum[axis])):
+                normal = sign * np.eye(3)[axis]
+                offset = sign * end - normal @ T_cloud_canonical.translation
+                planes.append([*T_cloud_canonical.inverse().rotate(normal), offset])
+    return torch.tensor(planes, dtype=torch.float32).reshape(-1, 4)
 
 
 def _with_target(query: GraspQuery) -> Tensor:

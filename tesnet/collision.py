@@ -10,7 +10,6 @@ from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
-from tesnet.query import Box
 from tesnet.visibility import depth_behind
 
 SHADOW_MARGIN = 0.01
@@ -22,7 +21,6 @@ BORDER = 0.005
 REACH_BEYOND = 0.04
 """How far beyond the workspace things are taken to go on."""
 
-_LEVEL = 0.5
 _BLOCK = 4_000_000
 _COARSE_STRIDE = 6
 
@@ -84,32 +82,13 @@ def points_in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tenso
     return x, y, z
 
 
-def beyond(cloud: PreparedCloud, workspace: Box) -> Tensor:
-    """Places (B, 3) where things that a side of the workspace cuts off are taken to go on, straight out of it.
-
-    The support, and whatever else lies across `up`, is no such side; without `up` there is none.
-
-    Args:
-        cloud: P observed points.
-        workspace: in the frame of the query.
-    """
-    if cloud.up is None:
-        return cloud.points[:0]
-    points = torch.from_numpy(cloud.T_cloud_canonical.apply(cloud.points.cpu().numpy()))
-    up = cloud.T_cloud_canonical.rotate(cloud.up.cpu().numpy())
-    steps = torch.arange(BORDER, REACH_BEYOND, BORDER, dtype=torch.float64)
-    found = []
-    for axis in range(3):
-        if abs(up[axis]) > _LEVEL:
-            continue
-        for end, sign in ((workspace.minimum[axis], -1.0), (workspace.maximum[axis], 1.0)):
-            cut = points[(points[:, axis] - end).abs() < BORDER]
-            shift = torch.zeros(len(steps), 3, dtype=torch.float64)
-            shift[:, axis] = sign * steps
-            found.append((cut[:, None] + shift).reshape(-1, 3))
-    places = torch.cat(found) if found else points[:0]
-    canonical = cloud.T_cloud_canonical.inverse().apply(places.numpy())
-    return torch.from_numpy(canonical).to(cloud.points)
+def beyond(cloud: PreparedCloud) -> Tensor:
+    """Places (B, 3) where things that a side of the workspace cuts off are taken to go on, straight out of it."""
+    steps = torch.arange(BORDER, REACH_BEYOND, BORDER, device=cloud.points.device)
+    distance = cloud.points @ cloud.sides[:, :3].T - cloud.sides[:, 3]
+    point, side = (distance.abs() < BORDER).nonzero(as_tuple=True)
+    places = cloud.points[point][:, None] + steps[:, None] * cloud.sides[side, None, :3]
+    return places.reshape(-1, 3)
 
 
 def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float) -> Tensor:

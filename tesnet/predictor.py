@@ -13,7 +13,7 @@ import torch
 
 from tesnet import candidates, cloud, collision, networks, ranking, support, weights
 from tesnet.errors import DeviceError, WeightsError
-from tesnet.geometry import PANDA, GraspSet, Gripper
+from tesnet.geometry import PANDA, GraspSet
 from tesnet.networks import Network
 from tesnet.networks.tesnet import CloudFeatures
 from tesnet.query import MAX_APPROACH_POINTS, Box, GraspQuery
@@ -30,6 +30,9 @@ GOOD_SCORE = 0.9
 
 FURTHER_SEARCHES = 4
 """At most so often, each time with four times as many approach points as the query names."""
+
+_SEED_STEP = 0x9E3779B97F4A7C15
+"""Between the seeds of one query's searches: queries whose seeds follow each other share none."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -219,19 +222,13 @@ class GraspPredictor:
     def _blocked(self, prepared: cloud.PreparedCloud, found: candidates.Candidates, query: GraspQuery) -> torch.Tensor:
         poses, hand = found.Ts_canonical_grasp, query.gripper
         blocked = collision.in_collision(prepared.points, poses, hand, hand.max_width, APPROACH_DISTANCE)
-        if query.workspace is not None:
-            unsafe = self._meets_what_is_cut_off(prepared, query.workspace, poses, hand)
-            if not bool((blocked | unsafe).all()):  # a guess must not leave nothing
-                blocked |= unsafe
+        places = collision.beyond(prepared)
+        unsafe = collision.in_collision(places, poses, hand, hand.max_width, APPROACH_DISTANCE)
+        if not bool((blocked | unsafe).all()):  # a guess must not leave nothing
+            blocked |= unsafe
         if query.unseen == "occupied":
             blocked |= collision.in_shadow(prepared, poses, hand, hand.max_width)
         return blocked
-
-    def _meets_what_is_cut_off(
-        self, prepared: cloud.PreparedCloud, workspace: Box, poses: torch.Tensor, hand: Gripper
-    ) -> torch.Tensor:
-        places = collision.beyond(prepared, workspace)
-        return collision.in_collision(places, poses, hand, hand.max_width, APPROACH_DISTANCE)
 
     def _synchronise(self) -> None:
         if self.device.type == "cuda":  # or a stage's work would be counted in a later one
@@ -294,7 +291,7 @@ class _Proposal:
 def _further(query: GraspQuery, number: int) -> GraspQuery:
     """The query, for its further search of this number."""
     count = min(4 * query.num_approach_points, MAX_APPROACH_POINTS)
-    return replace(query, num_approach_points=count, seed=(query.seed + number) % 2**63)
+    return replace(query, num_approach_points=count, seed=(query.seed + number * _SEED_STEP) % 2**63)
 
 
 def configuration_of(network_config: Any) -> dict[str, dict[str, Any]]:

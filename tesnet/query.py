@@ -116,7 +116,7 @@ class GraspQuery:
         points: (N, 3) metres; stored as float32.
         viewpoints: (3,) or (V, 3) camera positions in the cloud frame; None is the origin.
         up: (3,) direction against gravity, made unit length.
-        workspace: points outside are ignored.
+        workspace: points outside are ignored; with `up`, scores allow for what may stand beyond its upright sides.
         support_height: height of the support plane along `up`, metres, or `auto` to find the dominant plane.
         target: candidates come from it alone; the other points still count for collision.
         approach: cone of directions of travel.

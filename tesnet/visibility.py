@@ -1,6 +1,6 @@
-"""What the camera saw and what lies hidden behind it: an image of ranges for each viewpoint. Knows no hand.
+"""What the camera saw, what lies hidden behind it, by an image of ranges for each viewpoint, and what was left out.
 
-Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
+Knows no hand. Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
 """
 
 from __future__ import annotations
@@ -24,6 +24,16 @@ def depth_behind(cloud: PreparedCloud, places: Tensor) -> Tensor:
     """
     depths = torch.stack([_depth_behind(viewpoint, cloud.points, places) for viewpoint in cloud.viewpoints])
     return depths.amin(dim=0)
+
+
+def outside(cloud: PreparedCloud, places: Tensor) -> Tensor:
+    """How far places (..., 3) lie outside the nearest side of the workspace; negative inside, -infinity without sides.
+
+    Nothing is known of what stands there: its points were ignored.
+    """
+    if len(cloud.sides) == 0:
+        return torch.full(places.shape[:-1], -torch.inf, dtype=places.dtype, device=places.device)
+    return (places @ cloud.sides[:, :3].T - cloud.sides[:, 3]).amax(dim=-1)
 
 
 def _depth_behind(viewpoint: Tensor, points: Tensor, places: Tensor) -> Tensor:

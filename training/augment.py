@@ -12,14 +12,16 @@ from training.views import LabelledView
 
 WITHHOLD_UP = 0.1
 WITHHOLD_SUPPORT = 0.1
-"""Chances that a view is shown without `up` (and so without a support plane), or without the plane alone."""
+WITHHOLD_SIDES = 0.1
+"""Chances that a view is shown without `up` (and so without support plane and sides), without the plane, and without
+the sides of the workspace."""
 
 
 def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
     """The view with its cloud centred (the paper's eq. 9) and turned at random (eqs. 10 to 12).
 
-    TES-Net's inputs do not change under this, other networks' do. `up` and the support plane are withheld in some
-    views, since a caller may not know them.
+    TES-Net's inputs do not change under this, other networks' do. `up`, the support plane and the sides
+    of the workspace are withheld in some views, since a caller may not know them.
     """
     cloud = view.cloud
     rotation = random_rotation(rng)
@@ -30,6 +32,8 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
         height -= float(centre @ cloud.up)
     chance = rng.random()
     keep_up = chance >= WITHHOLD_UP
+    sides = torch.cat([cloud.sides[:, :3] @ turn.T, cloud.sides[:, 3:] - cloud.sides[:, :3] @ centre[:, None]], dim=1)
+    keep_sides = keep_up and rng.random() >= WITHHOLD_SIDES
     turned = replace(
         cloud,
         points=(cloud.points - centre) @ turn.T,
@@ -38,6 +42,7 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
         viewpoints=(cloud.viewpoints - centre) @ turn.T,
         up=turn @ cloud.up if cloud.up is not None and keep_up else None,
         support_height=height if keep_up and chance >= WITHHOLD_UP + WITHHOLD_SUPPORT else None,
+        sides=sides if keep_sides else sides[:0],
         T_cloud_canonical=cloud.T_cloud_canonical @ Pose(rotation, rotation @ -centre.double().numpy()).inverse(),
     )
     shift = torch.stack([centre, centre, torch.zeros(3), torch.zeros(3)])  # two points and two directions

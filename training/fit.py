@@ -59,7 +59,7 @@ class Recipe:
 PRESETS = {
     "default": Recipe(),
     # For weights that are good already (`start`), on many more views than they saw.
-    "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=4),
+    "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=3),
     # Section 5.1: Adam, the rate halved after 6 stagnant epochs; the rate itself is Edge Grasp Network's.
     "paper": Recipe(
         optimiser="adam", learning_rate=1e-4, weight_decay=0.0, patience=6, smallest_learning_rate=1e-6,
@@ -111,7 +111,7 @@ def fit(
         threads: of the CPU.
         seed: of the first weights, of orders and of draws.
         version: that the weights' header carries.
-        start: weights to begin with; None for random ones.
+        start: weights to begin with, also older ones with fewer inputs; None for random ones.
 
     Raises:
         LabelsError: folders without usable labels, a checkpoint of another recipe or seed, or `start` of another
@@ -133,10 +133,7 @@ def fit(
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
     if start is not None:
-        first, header = networks.load(start)
-        if (header.network, first.config) != (name, network.config):
-            raise LabelsError(f"{start} holds a {header.network} of another configuration; begin without --start")
-        network.load_state_dict(first.state_dict())
+        _begin_with(start, name, network)
     progress = _resume(checkpoint, network, optimiser) or _Progress(asdict(recipe), seed, recipe.learning_rate)
     if (progress.recipe, progress.seed) != (asdict(recipe), seed):
         raise LabelsError(f"{checkpoint} is of another recipe or seed; use the same ones, or another --out")
@@ -163,6 +160,19 @@ def fit(
                                   "seconds": time.monotonic() - started}) + "\n")  # fmt: skip
     _, header = weights.load(out)
     return dict(header.training or {})
+
+
+def _begin_with(start: Path, name: str, network: Network) -> None:
+    """Loads weights; where a layer has got inputs since they were made, which stand last, theirs begin at zero."""
+    state, header = weights.load(start)
+    shapes = {key: tensor.shape for key, tensor in network.state_dict().items()}
+    for key, tensor in state.items():
+        if key in shapes and tensor.dim() == len(shapes[key]) == 2:
+            state[key] = functional.pad(tensor, (0, max(0, shapes[key][1] - tensor.shape[1])))
+    same = header.configuration.get("network") == json.loads(json.dumps(asdict(network.config)))
+    if header.network != name or not same or {key: tensor.shape for key, tensor in state.items()} != shapes:
+        raise LabelsError(f"{start} holds a {header.network} of another configuration; begin without --start")
+    network.load_state_dict(state)
 
 
 def _optimiser(network: Network, recipe: Recipe) -> torch.optim.Optimizer:

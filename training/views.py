@@ -79,6 +79,7 @@ def save_scene(path: Path, description: Mapping[str, Any], views: Sequence[Label
             "viewpoints": cloud.viewpoints.tolist(),
             "up": None if cloud.up is None else cloud.up.tolist(),
             "support_height": cloud.support_height,
+            "sides": cloud.sides.tolist(),
             "T_cloud_canonical": cloud.T_cloud_canonical.matrix.tolist(),
             "scene": view.scene,
         }
@@ -146,6 +147,7 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
         viewpoints=viewpoints,
         up=None if frame["up"] is None else torch.tensor(frame["up"]),
         support_height=frame["support_height"],
+        sides=torch.tensor(frame["sides"]).reshape(-1, 4),
         T_cloud_canonical=Pose.from_matrix(frame["T_cloud_canonical"]),
     )
     return LabelledView(

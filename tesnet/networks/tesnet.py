@@ -20,14 +20,21 @@ from tesnet.collision import points_in_grasp_frames
 from tesnet.geometry import PANDA
 from tesnet.layers import PointTransformerConv, SAGEConv
 from tesnet.patches import Patches, group, pool
-from tesnet.visibility import depth_behind
+from tesnet.visibility import depth_behind, outside
 
 _POINT_INPUTS = 7
 _EDGE_INPUTS = 4
 _REGION_INPUTS = 7
-_CANDIDATE_INPUTS = 16
+_CANDIDATE_INPUTS = 23
 _LENGTH = 0.02
 """Metres that count as 1 in the network's inputs."""
+
+_ENDS = [(0.0, 0.0, 0.0)] + [
+    (0.0, side * y, z)
+    for y, z in ((0.052, PANDA.tip_offset), (0.052, PANDA.palm_front), (0.1, PANDA.palm_front - 0.01))
+    for side in (-1, 1)
+]
+"""The TCP, and tips, roots of the fingers and ends of the palm, outermost, in the grasp frame: metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -292,7 +299,9 @@ def edge_features(points: Tensor, normals: Tensor, neighbours: Tensor) -> Tensor
 
 
 def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tensor, sign: Tensor) -> Tensor:
-    """(C, 16): the pair, numbers of points near, n_a, line of sight and up, all in the grasp frame, and the height."""
+    """(C, 23): the pair, numbers of points near, n_a, line of sight and up, all in the grasp frame, the height, and how
+    far the hand reaches out of the workspace.
+    """
     poses = candidates.Ts_canonical_grasp
     rotation = poses[:, :3, :3]
     flip = _mirror(sign)
@@ -307,7 +316,9 @@ def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tens
         if cloud.support_height is not None:
             height[:, 0] = (poses[:, :3, 3] @ cloud.up - cloud.support_height) / (5 * _LENGTH)
             height[:, 1] = 1
-    return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height], 1)
+    ends = torch.tensor(_ENDS, device=poses.device) @ rotation.transpose(1, 2) + poses[:, None, :3, 3]
+    out = (outside(cloud, ends) / _LENGTH).clamp(-2, 2)
+    return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height, out], 1)
 
 
 def _mirror(sign: Tensor) -> Tensor:

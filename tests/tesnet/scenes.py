@@ -133,6 +133,7 @@ def bare_cloud(points: Array, viewpoints: Array = CAMERA[None], **fields: Any) -
         "viewpoints": cameras,
         "up": None,
         "support_height": None,
+        "sides": torch.zeros(0, 4),
         "T_cloud_canonical": Pose.identity(),
     }
     return cloud.PreparedCloud(**{**given, **fields})
@@ -149,6 +150,7 @@ def moved_cloud(ready: cloud.PreparedCloud, motion: Pose) -> cloud.PreparedCloud
         return (points.double() @ turn.T + shift).float()
 
     up = None if ready.up is None else rotate(ready.up)
+    normals = rotate(ready.sides[:, :3])
     height = ready.support_height
     return replace(
         ready,
@@ -158,6 +160,7 @@ def moved_cloud(ready: cloud.PreparedCloud, motion: Pose) -> cloud.PreparedCloud
         viewpoints=move(ready.viewpoints),
         up=up,
         support_height=None if height is None or up is None else height + float(shift @ up.double()),
+        sides=torch.cat([normals, ready.sides[:, 3:] + (normals.double() @ shift).float()[:, None]], dim=1),
         T_cloud_canonical=ready.T_cloud_canonical @ motion.inverse(),
     )
 

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -117,6 +118,21 @@ def test_a_mirrored_scene_scores_as_the_mirror_option_says() -> None:
     one = torch.ones(len(found))
     torch.testing.assert_close(score(found, one), score(found))
     assert (score(found, -one) - score(found)).abs().max() > 1e-4
+
+
+def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
+    ready, found = example()
+    network = fresh_network()
+    tcp = found.Ts_canonical_grasp[0, :3, 3]
+
+    @torch.inference_mode()
+    def with_side(distance: float) -> torch.Tensor:
+        """Logits beside a plane across x, so far from the first candidate's TCP."""
+        bounded = replace(ready, sides=torch.tensor([[1.0, 0.0, 0.0, float(tcp[0]) + distance]]))
+        return network.score(features(), bounded, found)
+
+    torch.testing.assert_close(with_side(1.0), score(found), atol=1e-5, rtol=0)
+    assert (with_side(0.01) - score(found))[0].abs() > 1e-4
 
 
 def test_point_pair_features_are_distances_and_cosines() -> None:

@@ -1,13 +1,16 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from typing import Any
 
 import numpy as np
+import pytest
 import torch
 
 from tesnet.cloud import PreparedCloud
-from tesnet.visibility import depth_behind
-from tests.tesnet.scenes import ask, prepared
+from tesnet.query import Box
+from tesnet.visibility import depth_behind, outside
+from tests.tesnet.scenes import CAMERA, UP, WORKSPACE, ask, prepared, tabletop
 
 
 def wall() -> PreparedCloud:
@@ -39,3 +42,17 @@ def test_a_place_that_one_of_two_viewpoints_sees_is_not_hidden() -> None:
     from_below = places(cloud, [[0.0, 0.0, -0.5]])
     both = replace(cloud, viewpoints=torch.cat([cloud.viewpoints, from_below]))
     assert float(depth_behind(both, hidden)) < -0.04
+
+
+def test_how_far_outside_is_the_distance_from_the_nearest_side_of_the_workspace() -> None:
+    box = Box(np.array([-0.05, -0.08, -0.02]), np.array([0.06, 0.07, 0.3]))
+    cloud = prepared(ask(tabletop(), viewpoints=CAMERA, up=UP, workspace=box))
+    positions = [[0.0, 0.0, 0.1], [0.1, 0.0, 0.1], [-0.07, 0.05, 0.0], [0.0, 0.09, 0.2], [0.0, 0.0, 0.6]]
+    expected = [-0.05, 0.04, 0.02, 0.02, -0.05]  # the last is outside above, where nothing is bounded
+    np.testing.assert_allclose(outside(cloud, places(cloud, positions)), expected, atol=1e-6)
+
+
+@pytest.mark.parametrize("options", [{"up": UP}, {"workspace": WORKSPACE}])
+def test_without_workspace_or_up_nothing_is_outside(options: dict[str, Any]) -> None:
+    cloud = prepared(ask(tabletop(), viewpoints=CAMERA, **options))
+    assert outside(cloud, places(cloud, [[9.0, 9.0, 9.0]])).item() == -np.inf

@@ -7,7 +7,7 @@ from pathlib import Path
 import torch
 
 from tesnet import candidates
-from tests.tesnet.scenes import prepared, tabletop_query
+from tests.tesnet.scenes import WORKSPACE, prepared, tabletop_query
 from training.views import OUTCOMES, LabelledView, pairs_of, save_scene
 
 
@@ -19,7 +19,7 @@ def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) 
         count: labels.
         positives: so many are successes; a third unless given.
     """
-    query = tabletop_query(seed, max_candidates=count)
+    query = tabletop_query(seed, max_candidates=count, workspace=WORKSPACE)
     ready = prepared(query)
     found, _ = candidates.generate(ready, query, candidates.CandidateConfig())
     assert len(found) == count

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from tesnet.visibility import outside
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view
 from training.augment import augment, random_rotation
@@ -31,11 +32,11 @@ def test_the_cloud_is_centred_and_turned_rigidly() -> None:
     np.testing.assert_allclose(back, before.T_cloud_canonical.apply(before.points.numpy()), atol=1e-6)
 
 
-def test_a_network_of_invariants_scores_what_keeps_up_and_support_the_same() -> None:
+def test_a_network_of_invariants_scores_what_withholds_nothing_the_same() -> None:
     unchanged = 0
     for seed in range(8):
         view = turned(seed)
-        if view.cloud.up is not None and view.cloud.support_height is not None:
+        if view.cloud.support_height is not None and len(view.cloud.sides):
             unchanged += 1
             change = (logits(view) - logits(VIEW)).abs()
             assert change.median() < 1e-4
@@ -43,12 +44,23 @@ def test_a_network_of_invariants_scores_what_keeps_up_and_support_the_same() -> 
     assert unchanged >= 4
 
 
-def test_up_and_support_are_withheld_now_and_then() -> None:
+def test_the_sides_turn_with_the_cloud() -> None:
+    before, after = (
+        outside(view.cloud, view.candidates.Ts_canonical_grasp[:, :3, 3])
+        for view in (VIEW, next(view for view in map(turned, range(9)) if len(view.cloud.sides)))
+    )
+    torch.testing.assert_close(after, before, atol=1e-6, rtol=0)
+    assert before.max() > before.min()
+
+
+def test_up_support_and_sides_are_withheld_now_and_then() -> None:
     views = [turned(seed).cloud for seed in range(60)]
     without_up = sum(cloud.up is None for cloud in views)
     without_support = sum(cloud.support_height is None for cloud in views)
+    without_sides = sum(len(cloud.sides) == 0 for cloud in views)
     assert 0 < without_up < without_support < 30
-    assert all(cloud.support_height is None for cloud in views if cloud.up is None)
+    assert 0 < without_up < without_sides < 30
+    assert all(cloud.support_height is None and len(cloud.sides) == 0 for cloud in views if cloud.up is None)
 
 
 def test_augmentation_repeats_for_a_seed_and_leaves_the_view_alone() -> None:

@@ -11,7 +11,7 @@ import numpy as np
 import pytest
 import torch
 
-from tesnet import weights
+from tesnet import networks, weights
 from tesnet.predictor import GraspPredictor
 from tests.tesnet.scenes import tabletop_query
 from tests.training.synthetic import labelled_view, write
@@ -95,6 +95,21 @@ def test_a_logit_of_zero_is_an_even_chance_at_a_balanced_prior(shown: float) -> 
     fitting._view_loss(network, view, log_odds, recipe, np.random.default_rng(0)).backward()  # type: ignore[arg-type]
     assert logit.grad is not None
     assert float(logit.grad) == pytest.approx(0, abs=1e-6)
+
+
+def test_weights_with_fewer_inputs_are_begun_with_and_others_refused(folder: Path, tmp_path: Path) -> None:
+    run(folder, tmp_path / "now.safetensors", epochs=1)
+    state, header = weights.load(tmp_path / "now.safetensors")
+    older = {**state, "candidate.weight": state["candidate.weight"][:, :-3]}
+    weights.save(tmp_path / "older.safetensors", older, header)
+    network = networks.build("tesnet")
+    fitting._begin_with(tmp_path / "older.safetensors", "tesnet", network)
+    begun = network.state_dict()["candidate.weight"]
+    assert torch.equal(begun[:, :-3], state["candidate.weight"][:, :-3])
+    assert not begun[:, -3:].any()
+    weights.save(tmp_path / "narrow.safetensors", {**state, "lift.weight": state["lift.weight"][:-1]}, header)
+    with pytest.raises(LabelsError, match="of another configuration; begin without --start"):
+        fitting._begin_with(tmp_path / "narrow.safetensors", "tesnet", network)
 
 
 def test_training_learns_the_training_views(folder: Path, tmp_path: Path) -> None:

@@ -40,6 +40,8 @@ def test_labels_round_trip(tmp_path: Path) -> None:
         assert after.cloud.up is not None
         torch.testing.assert_close(after.cloud.up, before.cloud.up)
         assert after.cloud.support_height == before.cloud.support_height
+        assert len(after.cloud.sides) == 4
+        assert torch.equal(after.cloud.sides, before.cloud.sides)
         np.testing.assert_array_equal(after.cloud.T_cloud_canonical.matrix, before.cloud.T_cloud_canonical.matrix)
 
 
