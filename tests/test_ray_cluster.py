@@ -112,10 +112,11 @@ def test_rounds_end_the_same_on_a_cluster_where_every_worker_has_a_service(
 def test_scenes_are_labelled_the_same_on_a_cluster(
     served: ServiceProcess, settings_of_ray: dict[str, str], tmp_path: Path
 ) -> None:
-    asked = ["generate", "--scene", "packed", "--objects", "procedural-train", "--labels", 1, "--views", 1]
-    asked += ["--labels-per-view", 6, "--workers", 1, "--seed", 5]
-    run("training", *asked, "--out", tmp_path / "here", environment=settings_of_ray)
-    run("training", *asked, "--ray", ready(served)["ray"], "--out", tmp_path / "there", environment=settings_of_ray)
+    asked = ["generate", "--scene", "packed", "--objects", "procedural-train", "--labels", 7, "--views", 1]
+    asked += ["--labels-per-view", 6, "--seed", 5]
+    run("training", *asked, "--workers", 1, "--out", tmp_path / "here", environment=settings_of_ray)
+    on_ray = ["--workers", 2, "--ray", ready(served)["ray"], "--out", tmp_path / "there"]
+    run("training", *asked, *on_ray, environment=settings_of_ray)
     names = [sorted(path.name for path in (tmp_path / side).iterdir()) for side in ("here", "there")]
     assert names[0] == names[1]
     assert sum(name.endswith(".npz") for name in names[0]) == 2
