@@ -74,7 +74,7 @@ def application(replicas: Replicas) -> Application:
     number: dict[str, Any] = {"num_replicas": replicas.min_replicas}
     if replicas.max_replicas > replicas.min_replicas:
         scaling = replicas.model_dump(include={"min_replicas", "max_replicas", "target_ongoing_requests"})
-        number = {"autoscaling_config": scaling}
+        number = {"autoscaling_config": {**scaling, "downscale_delay_s": replicas.downscale_delay}}
     deploy = serve.deployment(
         name=NAME,
         max_ongoing_requests=requests,

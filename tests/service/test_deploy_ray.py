@@ -6,11 +6,12 @@ import asyncio
 import subprocess
 import sys
 from pathlib import Path
+from typing import Any
 
 import httpx
 import pytest
 
-from service.deploy.ray import replica_app, replica_settings, replicas_from
+from service.deploy.ray import application, replica_app, replica_settings, replicas_from
 from service.settings import InvalidSetting, Replicas, Settings
 from tesnet.errors import TesnetError
 
@@ -30,6 +31,7 @@ def test_one_number_of_replicas_is_a_fixed_one() -> None:
         ({"gpus": -1.0}, "--gpus is -1.0"),
         ({"gpus": 1.5}, "--gpus is 1.5; expected: .* or a whole number"),
         ({"target_ongoing_requests": float("nan")}, "--target-ongoing-requests is nan"),
+        ({"downscale_delay": -1.0}, "--downscale-delay is -1.0; expected: Seconds"),
     ],
 )
 def test_an_option_that_cannot_be_used_is_named_with_its_remedy(options: dict[str, float], words: str) -> None:
@@ -61,6 +63,12 @@ def test_a_replica_has_started_when_its_network_is_warm() -> None:
     assert asyncio.run(go()) == (200, [])
 
 
+@pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`")  # Ray does, where it is loaded
+def test_fewer_replicas_are_as_far_off_as_the_option_says() -> None:
+    bound: Any = application(Replicas(max_replicas=3, downscale_delay=7))._bound_deployment
+    assert bound._deployment_config.autoscaling_config.downscale_delay_s == 7
+
+
 def test_a_replica_without_weights_does_not_start(tmp_path: Path) -> None:
     async def go() -> None:
         app = replica_app(Settings(device="cpu", weights=tmp_path / "none.safetensors"))
@@ -74,7 +82,15 @@ def test_a_replica_without_weights_does_not_start(tmp_path: Path) -> None:
 def test_the_command_says_what_it_cannot_use_before_it_starts_a_cluster() -> None:
     command = [sys.executable, "-m", "service.deploy.ray"]
     helped = subprocess.run([*command, "--help"], capture_output=True, text=True, timeout=60, check=True)
-    for option in ("--min-replicas", "--max-replicas", "--target-ongoing-requests", "--cpus", "--gpus", "--address"):
+    for option in (
+        "--min-replicas",
+        "--max-replicas",
+        "--target-ongoing-requests",
+        "--cpus",
+        "--gpus",
+        "--downscale-delay",
+        "--address",
+    ):
         assert option in helped.stdout
     for arguments, words in ((["--cpus", "0"], "--cpus is 0.0"), (["--address", "nowhere"], "--address is 'nowhere'")):
         ended = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120, check=False)
