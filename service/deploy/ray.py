@@ -255,16 +255,23 @@ def _await_ready(url: str) -> None:
 
 @contextmanager
 def _cluster(address: str) -> Iterator[None]:
-    """Connected to a Ray cluster; one that is started here listens on the loopback interface alone.
+    """Connected to a Ray cluster; one that is started here listens on loopback alone, but for Serve's replicas.
 
     Raises:
-        InvalidSetting: there is no cluster at the address.
+        InvalidSetting: there is no cluster at the address, or one that is started here would obey everybody.
     """
     os.environ.setdefault("RAY_USAGE_STATS_ENABLED", "0")
     if address == LOCAL:
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # to Ray this means: one machine, 127.0.0.1
         # A proxy that is slow to start on a busy machine is replaced after three of these, and never gets there.
         os.environ.setdefault("RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S", "60")
+        mode = os.environ.get("RAY_AUTH_MODE", "token")  # which is what Ray takes for a cluster of its own
+        if mode.lower() != "token":
+            raise InvalidSetting(
+                "RAY_AUTH_MODE",
+                f"is {mode!r}; Serve's replicas listen on every interface, and whoever reaches them could run programs "
+                "here: leave it unset, or `token`",
+            )
     import ray  # noqa: PLC0415 - reads the environment when it is loaded
 
     try:

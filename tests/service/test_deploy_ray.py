@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import os
 import subprocess
 import sys
 from pathlib import Path
@@ -61,6 +62,20 @@ def test_a_replica_has_started_when_its_network_is_warm() -> None:
 
     # Serve's proxy adds the id itself.
     assert asyncio.run(go()) == (200, [])
+
+
+def test_a_cluster_that_would_obey_everybody_is_not_started() -> None:
+    ended = subprocess.run(
+        [sys.executable, "-m", "service.deploy.ray"],
+        env={**os.environ, "RAY_AUTH_MODE": "disabled"},
+        capture_output=True,
+        text=True,
+        timeout=120,
+        check=False,
+    )
+    assert ended.returncode == 2
+    assert "RAY_AUTH_MODE is 'disabled'; " in ended.stderr
+    assert "leave it unset, or `token`" in ended.stderr
 
 
 @pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`")  # Ray does, where it is loaded
