@@ -9,8 +9,10 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import uuid
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -167,12 +169,41 @@ def test_a_killed_replica_loses_no_request_and_sigterm_ends_in_order(served: Ser
     served.wait_for("stopped")
 
 
+@pytest.mark.parametrize("stage", [b"gcs_server", b"ray::ServeController", REPLICA])
+def test_sigterm_while_it_starts_ends_in_order_and_leaves_no_process(
+    stage: bytes, settings_of_ray: dict[str, str]
+) -> None:
+    token = uuid.uuid4().hex
+    settings = {**settings_of_ray, "RAY_AUTH_TOKEN": token, "GRASP_PORT": str(_free_port())}
+    command = [sys.executable, "-m", "service.deploy.ray", "--cpus", "0.1"]
+    with running_service(command, settings, OnRay) as service:
+        while not any(stage in command for command in descendants(service.process.pid).values()):
+            assert service.process.poll() is None
+            time.sleep(0.001)
+        service.process.terminate()
+        assert service.process.wait(120) == 0
+        while any(f"RAY_AUTH_TOKEN={token}".encode() in environment for environment in environments()):
+            time.sleep(0.1)
+
+
+def environments() -> Iterator[bytes]:
+    """Of all processes that may be looked at."""
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with suppress(OSError):
+            yield path.read_bytes()
+
+
 def replicas(parent: int) -> list[int]:
     """Process ids of the replicas among the descendants of a process."""
-    found = []
-    for task in Path(f"/proc/{parent}/task").iterdir():
-        for child in map(int, (task / "children").read_text().split()):
-            if Path(f"/proc/{child}/cmdline").read_bytes().startswith(REPLICA):
-                found.append(child)
-            found += replicas(child)
+    return [child for child, command in descendants(parent).items() if command.startswith(REPLICA)]
+
+
+def descendants(parent: int) -> dict[int, bytes]:
+    """Process ids of the descendants of a process, with their command lines."""
+    found: dict[int, bytes] = {}
+    for task in Path(f"/proc/{parent}/task").glob("*/children"):
+        with suppress(OSError):  # it ended meanwhile
+            for child in map(int, task.read_text().split()):
+                found[child] = Path(f"/proc/{child}/cmdline").read_bytes()
+                found |= descendants(child)
     return found

@@ -4,8 +4,10 @@ from __future__ import annotations
 
 import asyncio
 import os
+import signal
 import subprocess
 import sys
+import time
 from pathlib import Path
 from typing import Any
 
@@ -15,6 +17,7 @@ import pytest
 from service.deploy.ray import application, replica_app, replica_settings, replicas_from
 from service.settings import InvalidSetting, Replicas, Settings
 from tesnet.errors import TesnetError
+from tests.conftest import hears, running_service
 
 
 def test_one_number_of_replicas_is_a_fixed_one() -> None:
@@ -76,6 +79,15 @@ def test_a_cluster_that_would_obey_everybody_is_not_started() -> None:
     assert ended.returncode == 2
     assert "RAY_AUTH_MODE is 'disabled'; " in ended.stderr
     assert "leave it unset, or `token`" in ended.stderr
+
+
+def test_sigterm_before_ray_is_loaded_ends_the_command_with_0() -> None:
+    with running_service([sys.executable, "-m", "service.deploy.ray"], {}) as command:
+        while not hears(command.process.pid, signal.SIGTERM):
+            assert command.process.poll() is None
+            time.sleep(0.001)
+        command.process.terminate()
+        assert command.process.wait(30) == 0
 
 
 @pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`")  # Ray does, where it is loaded
