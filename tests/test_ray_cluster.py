@@ -26,6 +26,7 @@ from tests.conftest import ServiceProcess, running_service
 ROOT = Path(__file__).resolve().parents[1]
 TIMES = {"timings_ms", "latency", "latency_ms", "this_run"}
 REPLICA = b"ray::ServeReplica"
+OCTETS = "application/octet-stream"
 CLIENTS = 3
 REQUESTS = 4
 """Of each client, once a replica was killed."""
@@ -131,6 +132,14 @@ def test_scenes_are_labelled_the_same_on_a_cluster(
             assert without_times(json.loads(here.read_text())) == without_times(json.loads(there.read_text()))
 
 
+def test_an_answer_has_one_request_id_whatever_the_client_sends(served: ServiceProcess) -> None:
+    for given, kept in (("robot-7/42", True), ("bad%20id|x", False)):
+        answer = httpx.get(ready(served)["url"] + "/nowhere", headers={"X-Request-ID": given})
+        assert answer.status_code == 404
+        assert answer.headers.get_list("X-Request-ID") == [answer.json()["request_id"]]
+        assert (answer.json()["request_id"] == given) is kept
+
+
 def test_a_killed_replica_loses_no_request_and_sigterm_ends_in_order(served: ServiceProcess) -> None:
     points = np.load(ROOT / "examples" / "clutter.npy", allow_pickle=False)[::8]
     replies: list[int] = []
@@ -165,8 +174,16 @@ def test_a_killed_replica_loses_no_request_and_sigterm_ends_in_order(served: Ser
     assert httpx.get(ready(served)["url"] + "/health/ready").status_code == 200
 
     served.process.terminate()
+    refusals: list[httpx.Response] = []
+    with httpx.Client(base_url=ready(served)["url"], timeout=60) as http, suppress(httpx.TransportError):
+        while True:  # until there is nothing to connect to
+            answer = http.post("/grasps", content=points.tobytes(), headers={"Content-Type": OCTETS})
+            if answer.status_code != 200:
+                refusals.append(answer)
     assert served.process.wait(120) == 0
     served.wait_for("stopped")
+    assert {(answer.status_code, answer.headers["Retry-After"]) for answer in refusals} == {(503, "1")}
+    assert {answer.json()["type"] for answer in refusals} == {"urn:tes-net:problem:not-ready"}
 
 
 @pytest.mark.parametrize("stage", [b"gcs_server", b"ray::ServeController", REPLICA])

@@ -28,10 +28,13 @@ from typing import TYPE_CHECKING, Any
 import anyio.to_thread
 import httpx
 from pydantic import ValidationError
-from starlette.datastructures import MutableHeaders
+from starlette.datastructures import Headers, MutableHeaders
+from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.errors import PROBLEM_JSON, NotReady, problem_response
 from service.logs import configure_logging
+from service.middleware import RequestRecord, request_id_of
 from service.settings import InvalidSetting, Replicas, Settings, load_settings, service_version
 
 if TYPE_CHECKING:
@@ -150,6 +153,49 @@ class _IdFromProxy:
             if message["type"] == "http.response.start":
                 del MutableHeaders(scope=message)["X-Request-ID"]
             await send(message)
+
+        await self._app(scope, receive, sending)
+
+
+def proxy_middlewares() -> list[Middleware]:
+    """What Serve's proxies of a cluster that serves nothing else put around themselves; `_connect` names it to them."""
+    return [Middleware(_AroundProxy)]
+
+
+class _AroundProxy:
+    """Makes what Serve's proxy says in its own words what the service says.
+
+    A request id that is unfit for a log is replaced before anybody sees it. A 404 for an application that is not there
+    (any more), and a 503 while no replica takes a request, become the problem that asks to come back.
+
+    Args:
+        app: the proxy.
+    """
+
+    def __init__(self, app: ASGIApp) -> None:
+        self._app = app
+
+    async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
+        """Answer one request."""
+        headers = MutableHeaders(scope=scope)
+        record = RequestRecord(request_id_of(headers.get("X-Request-ID")), time.perf_counter())
+        headers["X-Request-ID"] = record.request_id
+        refused = False
+
+        async def sending(message: Message) -> None:
+            nonlocal refused
+            if message["type"] == "http.response.start" and message["status"] in (
+                httpx.codes.NOT_FOUND,
+                httpx.codes.SERVICE_UNAVAILABLE,
+            ):
+                refused = Headers(raw=message["headers"]).get("Content-Type") != PROBLEM_JSON
+                if refused:
+                    why = "No replica takes requests: they start, end or are all busy; repeat the request after 1 s."
+                    answer = problem_response(NotReady(why, retry_after=1), {**scope, "state": {"record": record}})
+                    answer.headers["X-Request-ID"] = record.request_id
+                    await answer(scope, receive, send)
+            if not refused:
+                await send(message)
 
         await self._app(scope, receive, sending)
 
@@ -327,6 +373,7 @@ def _connect(address: str, ending: _Ending) -> None:
         os.environ.setdefault("RAY_ENABLE_WINDOWS_OR_OSX_CLUSTER", "0")  # to Ray this means: one machine, 127.0.0.1
         # A proxy that is slow to start on a busy machine is replaced after three of these, and never gets there.
         os.environ.setdefault("RAY_SERVE_PROXY_READY_CHECK_TIMEOUT_S", "60")
+        os.environ.setdefault("RAY_SERVE_HTTP_PROXY_CALLBACK_IMPORT_PATH", "service.deploy.ray:proxy_middlewares")
         mode = os.environ.get("RAY_AUTH_MODE", "token")  # which is what Ray takes for a cluster of its own
         if mode.lower() != "token":
             raise InvalidSetting(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import asyncio
 import os
+import re
 import signal
 import subprocess
 import sys
@@ -13,8 +14,13 @@ from typing import Any
 
 import httpx
 import pytest
+from starlette.datastructures import Headers
+from starlette.responses import PlainTextResponse, Response
+from starlette.types import ASGIApp, Receive, Scope, Send
 
-from service.deploy.ray import application, replica_app, replica_settings, replicas_from
+from service.deploy.ray import application, proxy_middlewares, replica_app, replica_settings, replicas_from
+from service.errors import PROBLEM_JSON
+from service.schemas import REQUEST_ID
 from service.settings import InvalidSetting, Replicas, Settings
 from tesnet.errors import TesnetError
 from tests.conftest import hears, running_service
@@ -65,6 +71,48 @@ def test_a_replica_has_started_when_its_network_is_warm() -> None:
 
     # Serve's proxy adds the id itself.
     assert asyncio.run(go()) == (200, [])
+
+
+def through_the_proxy(inside: ASGIApp, **headers: str) -> httpx.Response:
+    """The answer to a request through what Serve's proxies put around themselves."""
+
+    async def go() -> httpx.Response:
+        app = inside
+        for middleware in proxy_middlewares():
+            app = middleware.cls(app, *middleware.args, **middleware.kwargs)
+        async with httpx.AsyncClient(transport=httpx.ASGITransport(app), base_url="http://r") as http:
+            return await http.post("/grasps", headers=headers)
+
+    return asyncio.run(go())
+
+
+@pytest.mark.parametrize("status", [404, 503])
+def test_where_the_proxy_has_no_replica_to_ask_it_answers_the_problem_that_asks_to_come_back(status: int) -> None:
+    answer = through_the_proxy(PlainTextResponse("said by Serve", status), **{"X-Request-ID": "a-1"})
+    assert (answer.status_code, answer.headers["Retry-After"]) == (503, "1")
+    assert answer.headers["Content-Type"] == PROBLEM_JSON
+    assert answer.json()["type"] == "urn:tes-net:problem:not-ready"
+    assert answer.headers.get_list("X-Request-ID") == [answer.json()["request_id"]] == ["a-1"]
+
+
+@pytest.mark.parametrize(("status", "kind"), [(200, "application/json"), (404, PROBLEM_JSON), (500, "text/plain")])
+def test_the_proxy_passes_on_what_replicas_answer_and_that_it_lost_one(status: int, kind: str) -> None:
+    answer = through_the_proxy(Response(b"{}", status, media_type=kind))
+    assert (answer.status_code, answer.content) == (status, b"{}")
+
+
+@pytest.mark.parametrize(("given", "kept"), [("robot-7/42", True), ("bad%20id|x", False), ("", False)])
+def test_the_proxy_replaces_a_request_id_that_is_unfit_for_a_log(given: str, kept: bool) -> None:
+    seen: list[str] = []
+
+    async def inside(scope: Scope, receive: Receive, send: Send) -> None:
+        seen.extend(Headers(scope=scope).getlist("X-Request-ID"))
+        await Response()(scope, receive, send)
+
+    through_the_proxy(inside, **{"X-Request-ID": given})
+    (one,) = seen
+    assert re.fullmatch(REQUEST_ID, one)
+    assert (one == given) is kept
 
 
 def test_a_cluster_that_would_obey_everybody_is_not_started() -> None:
