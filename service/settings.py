@@ -153,6 +153,9 @@ class Replicas(BaseModel):
     target_ongoing_requests: float = Field(
         default=2.0, gt=0, le=1000, description="Requests a replica should have; more of them add replicas."
     )
+    downscale_delay: float = Field(
+        default=120.0, ge=0, le=86400, description="Seconds of less load before replicas are taken away, 0 to 86400."
+    )
     cpus: float = Field(default=1.0, gt=0, le=1024, description="CPU cores of a replica, more than 0.")
     gpus: float = Field(
         default=0.0, ge=0, le=64, description="GPUs of a replica: 0, a share such as 0.25, or a whole number."

@@ -2,10 +2,14 @@
 
 from __future__ import annotations
 
+import json
 import re
 import shutil
 import subprocess
-from collections.abc import Sequence
+import threading
+from collections.abc import Callable, Sequence
+from functools import cache
+from http.server import BaseHTTPRequestHandler, HTTPServer
 from pathlib import Path
 
 import httpx
@@ -16,8 +20,8 @@ from client import GraspClient
 
 ROOT = Path(__file__).resolve().parents[1]
 EXAMPLES = ROOT / "examples"
-CPP = EXAMPLES / "cpp" / "grasps.cpp"
-PACKAGES = "curl jq nodejs g++ libcurl4-openssl-dev nlohmann-json3-dev"
+SOURCES = {"cpp": EXAMPLES / "cpp" / "grasps.cpp", "rust": EXAMPLES / "rust" / "grasps.rs"}
+PACKAGES = "curl jq nodejs g++ libcurl4-openssl-dev nlohmann-json3-dev rustc"
 REMEDY = f"the examples need these Debian packages: apt-get install {PACKAGES}"
 
 
@@ -27,21 +31,26 @@ def run(command: Sequence[str]) -> subprocess.CompletedProcess[str]:
 
 
 @pytest.fixture(scope="module")
-def cpp_program(tmp_path_factory: pytest.TempPathFactory) -> str:
-    """The C++ example, built by the command that it documents."""
-    (documented,) = re.findall(r"^//   (g\+\+ .*)$", CPP.read_text(encoding="utf-8"), re.MULTILINE)
-    program = str(tmp_path_factory.mktemp("cpp") / "grasps")
-    built = run([program if word == "grasps" else word for word in documented.split()])
-    assert built.returncode == 0, f"{built.stderr}\nWhere a header or library is missing: {REMEDY}"
-    assert built.stderr == ""
-    return program
+def build(tmp_path_factory: pytest.TempPathFactory) -> Callable[[str], str]:
+    """Builds an example by the command that it documents, once; the program."""
+
+    @cache
+    def built(language: str) -> str:
+        (documented,) = re.findall(r"^//   ((?:g\+\+|rustc) .*)$", SOURCES[language].read_text("utf-8"), re.MULTILINE)
+        program = str(tmp_path_factory.mktemp(language) / "grasps")
+        ended = run([program if word == "grasps" else word for word in documented.split()])
+        assert ended.returncode == 0, f"{ended.stderr}\nWhere a header or library is missing: {REMEDY}"
+        assert ended.stderr == ""
+        return program
+
+    return built
 
 
-@pytest.fixture(params=["curl", "node", "cpp"])
-def example(request: pytest.FixtureRequest) -> list[str]:
+@pytest.fixture(params=["curl", "node", "cpp", "rust"])
+def example(request: pytest.FixtureRequest, build: Callable[[str], str]) -> list[str]:
     """The command that starts an example, without its arguments."""
-    if request.param == "cpp":
-        return [request.getfixturevalue("cpp_program")]
+    if request.param in SOURCES:
+        return [build(request.param)]
     if request.param == "node":
         return ["node", str(EXAMPLES / "node.mjs")]
     for program in ("curl", "jq"):
@@ -82,6 +91,29 @@ def test_an_example_says_where_nothing_was_found(example: list[str], service_url
     np.save(tmp_path / "one.npy", np.ones((1, 3), np.float32))
     ended = run([*example, service_url, str(tmp_path / "one.npy")])
     assert (ended.returncode, ended.stdout) == (0, "no grasps: too_few_points\n")
+
+
+def test_the_rust_example_reads_an_answer_in_chunks(build: Callable[[str], str]) -> None:
+    reason = 'two "words", \\ and é \U0001f980'
+    text = json.dumps({"warnings": [None, True, []], "grasps": [], "reason": reason}).encode()
+
+    class InChunks(BaseHTTPRequestHandler):
+        protocol_version = "HTTP/1.1"
+
+        def do_POST(self) -> None:
+            self.rfile.read(int(self.headers["Content-Length"]))
+            self.send_response(200)
+            self.send_header("Transfer-Encoding", "chunked")
+            self.end_headers()
+            for piece in (text[:11], text[11:], b""):
+                self.wfile.write(b"%x\r\n%s\r\n" % (len(piece), piece))
+
+    with HTTPServer(("127.0.0.1", 0), InChunks) as server:
+        answering = threading.Thread(target=server.handle_request)
+        answering.start()
+        ended = run([build("rust"), f"http://127.0.0.1:{server.server_port}"])
+        answering.join()
+    assert (ended.returncode, ended.stdout) == (0, f"no grasps: {reason}\n")
 
 
 def test_continuous_integration_installs_what_the_examples_need() -> None:

@@ -9,8 +9,10 @@ import socket
 import subprocess
 import sys
 import threading
+import time
 import uuid
 from collections.abc import Iterator
+from contextlib import suppress
 from pathlib import Path
 from typing import Any
 
@@ -24,6 +26,7 @@ from tests.conftest import ServiceProcess, running_service
 ROOT = Path(__file__).resolve().parents[1]
 TIMES = {"timings_ms", "latency", "latency_ms", "this_run"}
 REPLICA = b"ray::ServeReplica"
+OCTETS = "application/octet-stream"
 CLIENTS = 3
 REQUESTS = 4
 """Of each client, once a replica was killed."""
@@ -112,10 +115,11 @@ def test_rounds_end_the_same_on_a_cluster_where_every_worker_has_a_service(
 def test_scenes_are_labelled_the_same_on_a_cluster(
     served: ServiceProcess, settings_of_ray: dict[str, str], tmp_path: Path
 ) -> None:
-    asked = ["generate", "--scene", "packed", "--objects", "procedural-train", "--labels", 1, "--views", 1]
-    asked += ["--labels-per-view", 6, "--workers", 1, "--seed", 5]
-    run("training", *asked, "--out", tmp_path / "here", environment=settings_of_ray)
-    run("training", *asked, "--ray", ready(served)["ray"], "--out", tmp_path / "there", environment=settings_of_ray)
+    asked = ["generate", "--scene", "packed", "--objects", "procedural-train", "--labels", 7, "--views", 1]
+    asked += ["--labels-per-view", 6, "--seed", 5]
+    run("training", *asked, "--workers", 1, "--out", tmp_path / "here", environment=settings_of_ray)
+    on_ray = ["--workers", 2, "--ray", ready(served)["ray"], "--out", tmp_path / "there"]
+    run("training", *asked, *on_ray, environment=settings_of_ray)
     names = [sorted(path.name for path in (tmp_path / side).iterdir()) for side in ("here", "there")]
     assert names[0] == names[1]
     assert sum(name.endswith(".npz") for name in names[0]) == 2
@@ -126,6 +130,14 @@ def test_scenes_are_labelled_the_same_on_a_cluster(
                 assert {key: one[key].tobytes() for key in one} == {key: other[key].tobytes() for key in other}
         else:
             assert without_times(json.loads(here.read_text())) == without_times(json.loads(there.read_text()))
+
+
+def test_an_answer_has_one_request_id_whatever_the_client_sends(served: ServiceProcess) -> None:
+    for given, kept in (("robot-7/42", True), ("bad%20id|x", False)):
+        answer = httpx.get(ready(served)["url"] + "/nowhere", headers={"X-Request-ID": given})
+        assert answer.status_code == 404
+        assert answer.headers.get_list("X-Request-ID") == [answer.json()["request_id"]]
+        assert (answer.json()["request_id"] == given) is kept
 
 
 def test_a_killed_replica_loses_no_request_and_sigterm_ends_in_order(served: ServiceProcess) -> None:
@@ -162,16 +174,53 @@ def test_a_killed_replica_loses_no_request_and_sigterm_ends_in_order(served: Ser
     assert httpx.get(ready(served)["url"] + "/health/ready").status_code == 200
 
     served.process.terminate()
+    refusals: list[httpx.Response] = []
+    with httpx.Client(base_url=ready(served)["url"], timeout=60) as http, suppress(httpx.TransportError):
+        while True:  # until there is nothing to connect to
+            answer = http.post("/grasps", content=points.tobytes(), headers={"Content-Type": OCTETS})
+            if answer.status_code != 200:
+                refusals.append(answer)
     assert served.process.wait(120) == 0
     served.wait_for("stopped")
+    assert {(answer.status_code, answer.headers["Retry-After"]) for answer in refusals} == {(503, "1")}
+    assert {answer.json()["type"] for answer in refusals} == {"urn:tes-net:problem:not-ready"}
+
+
+@pytest.mark.parametrize("stage", [b"gcs_server", b"ray::ServeController", REPLICA])
+def test_sigterm_while_it_starts_ends_in_order_and_leaves_no_process(
+    stage: bytes, settings_of_ray: dict[str, str]
+) -> None:
+    token = uuid.uuid4().hex
+    settings = {**settings_of_ray, "RAY_AUTH_TOKEN": token, "GRASP_PORT": str(_free_port())}
+    command = [sys.executable, "-m", "service.deploy.ray", "--cpus", "0.1"]
+    with running_service(command, settings, OnRay) as service:
+        while not any(stage in command for command in descendants(service.process.pid).values()):
+            assert service.process.poll() is None
+            time.sleep(0.001)
+        service.process.terminate()
+        assert service.process.wait(120) == 0
+        while any(f"RAY_AUTH_TOKEN={token}".encode() in environment for environment in environments()):
+            time.sleep(0.1)
+
+
+def environments() -> Iterator[bytes]:
+    """Of all processes that may be looked at."""
+    for path in Path("/proc").glob("[0-9]*/environ"):
+        with suppress(OSError):
+            yield path.read_bytes()
 
 
 def replicas(parent: int) -> list[int]:
     """Process ids of the replicas among the descendants of a process."""
-    found = []
-    for task in Path(f"/proc/{parent}/task").iterdir():
-        for child in map(int, (task / "children").read_text().split()):
-            if Path(f"/proc/{child}/cmdline").read_bytes().startswith(REPLICA):
-                found.append(child)
-            found += replicas(child)
+    return [child for child, command in descendants(parent).items() if command.startswith(REPLICA)]
+
+
+def descendants(parent: int) -> dict[int, bytes]:
+    """Process ids of the descendants of a process, with their command lines."""
+    found: dict[int, bytes] = {}
+    for task in Path(f"/proc/{parent}/task").glob("*/children"):
+        with suppress(OSError):  # it ended meanwhile
+            for child in map(int, task.read_text().split()):
+                found[child] = Path(f"/proc/{child}/cmdline").read_bytes()
+                found |= descendants(child)
     return found

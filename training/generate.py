@@ -1,6 +1,7 @@
 """Simulated labels: scenes are made, observed and prepared as the service does it, and candidates are really tried.
 
-Each scene is one job and one file, so a run that is stopped goes on where it was (`--resume`).
+Each scene is one job and one file, so a run that is stopped goes on where it was (`--resume`). Which scenes there are
+in the end depends neither on the number of workers nor on their speed.
 """
 
 from __future__ import annotations
@@ -23,7 +24,7 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from simharness.camera import Observation, Preset, observe
-from simharness.crew import Done, Emit, Event, Work, crew
+from simharness.crew import Done, Emit, Work, crew
 from simharness.execute import label_strict, snapshot_of
 from simharness.hand import Hand
 from simharness.objects import ObjectModel, load_object_set
@@ -72,7 +73,9 @@ class GenerateConfig:
 def generate(
     config: GenerateConfig, labels: int, workers: int, out: Path, resume: bool = False, ray: str | None = None
 ) -> dict[str, Any]:
-    """Writes scenes to `out` until they hold `labels` labels; returns and stores the account of what is there.
+    """Writes scenes to `out`, in their order, until they hold `labels` labels; returns and stores the account of them.
+
+    Workers that have nothing else to do make scenes ahead; those after the one that reaches `labels` are not written.
 
     Args:
         config: what is generated.
@@ -101,16 +104,16 @@ def generate(
         progress.update(int(counts.sum()))
         given: deque[int] = deque()
         made: dict[int, _Made] = {}
-        while True:
-            while counts.sum() < labels and len(given) < 2 * workers:
+        while counts.sum() < labels:
+            while len(given) < 2 * workers:
                 given.append(next(pending))
                 makers.give(given[-1])
-            if not given:
-                break
-            # One scene at a time and in their order, so that which ones are made depends on no worker's speed.
             while given[0] not in made:
-                made |= _made(makers.hear(_HEAR_S), out)
-            scene = made.pop(given.popleft())
+                heard = makers.hear(_HEAR_S)
+                made |= {message.job: message.result for message in heard if isinstance(message, Done)}
+            number = given.popleft()
+            scene = made.pop(number)
+            _write(out / _file_name(number), scene.content)
             counts += scene.counts
             fresh += int(scene.counts.sum())
             busy_s += scene.seconds
@@ -192,15 +195,11 @@ class _Scenes:
         yield make
 
 
-def _made(heard: Sequence[Event | Done[int]], out: Path) -> dict[int, _Made]:
-    """The scenes among what was heard, by number; each is on the disk, as the whole file, when this returns."""
-    scenes: dict[int, _Made] = {message.job: message.result for message in heard if isinstance(message, Done)}
-    for number, scene in scenes.items():
-        path = out / _file_name(number)
-        draft = path.with_name(f".{path.name}.{os.getpid()}")
-        draft.write_bytes(scene.content)
-        draft.replace(path)
-    return scenes
+def _write(path: Path, content: bytes) -> None:
+    """The whole file or, when the run is stopped meanwhile, none."""
+    draft = path.with_name(f".{path.name}.{os.getpid()}")
+    draft.write_bytes(content)
+    draft.replace(path)
 
 
 def _file_name(number: int) -> str:

@@ -18,6 +18,7 @@ import numpy as np
 import pytest
 
 from tesnet.weights import SUMS, default_weights
+from tests.conftest import hears
 
 StartService = Callable[..., Any]
 
@@ -88,19 +89,12 @@ def test_the_drain_timeout_ends_a_request_that_never_ends(start_service: StartSe
 
 def test_sigterm_before_the_port_is_open_exits_with_0(start_service: StartService) -> None:
     with start_service() as service:
-        while not _handles(service.process.pid, signal.SIGTERM):  # or, as PID 1 of a container, it would be lost
+        while not hears(service.process.pid, signal.SIGTERM):  # or, as PID 1 of a container, it would be lost
             assert service.process.poll() is None
             time.sleep(0.001)
         service.process.send_signal(signal.SIGTERM)
         assert service.process.wait(30) == 0
     assert service.lines == []
-
-
-def _handles(pid: int, number: int) -> bool:
-    """Whether a process has a handler of its own for a signal."""
-    status = Path(f"/proc/{pid}/status").read_text()
-    caught = next(line for line in status.splitlines() if line.startswith("SigCgt:"))
-    return bool(int(caught.split()[1], 16) >> (number - 1) & 1)
 
 
 def test_port_0_picks_a_free_port_and_the_log_tells_it(shared_service: Any) -> None:

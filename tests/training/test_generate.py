@@ -64,6 +64,13 @@ def test_a_second_run_gives_equal_labels_and_a_longer_one_goes_on(labels: Path, 
     assert {name: after[name] for name in before} == before
 
 
+def test_more_workers_make_the_same_scenes(labels: Path, tmp_path: Path) -> None:
+    generate(CONFIG, 1, 2, tmp_path / "two")
+    one, two = scene_files([labels]), scene_files([tmp_path / "two"])
+    assert [path.name for path in two] == [path.name for path in one]
+    assert [arrays(path) for path in two] == [arrays(path) for path in one]
+
+
 def test_a_folder_of_labels_is_not_taken_over_unasked(labels: Path) -> None:
     with pytest.raises(LabelsError, match="add --resume"):
         generate(CONFIG, 1, 1, labels)
