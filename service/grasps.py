@@ -229,6 +229,7 @@ class GraspEndpoint:
         """Queue the query and wait for its answer, or for the client to hang up."""
         job = self._worker.submit(query, deadline)
         answer = asyncio.wrap_future(job.future)
+        answer.add_done_callback(_retrieve)  # an error that comes too late is the log's no more than the client's
         gone = asyncio.ensure_future(_hung_up(request))
         either: set[asyncio.Future[Any]] = {answer, gone}
         try:
@@ -285,6 +286,12 @@ def check_model(options: GraspOptions, loaded: ModelInfo) -> None:
     """
     if options.model != loaded.name:
         raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {loaded.name}")
+
+
+def _retrieve(answer: asyncio.Future[Answer]) -> None:
+    """Look at an answer's error, so that asyncio does not report one that nobody waits for any more."""
+    if not answer.cancelled():
+        answer.exception()
 
 
 async def _hung_up(request: Request) -> None:
