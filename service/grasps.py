@@ -178,7 +178,7 @@ class GraspEndpoint:
         decoded = time.perf_counter()
         query = asked.query
         record.fields["points"] = len(query.points)
-        answer = await self._predict(request, query, min(deadline, record.arrived + asked.timeout))
+        answer = await self._predict(request, query, deadline, record.arrived + asked.timeout)
         result = answer.result
         predicted = time.perf_counter()
         timings = {
@@ -225,9 +225,9 @@ class GraspEndpoint:
 
         return read
 
-    async def _predict(self, request: Request, query: GraspQuery, deadline: float) -> Answer:
+    async def _predict(self, request: Request, query: GraspQuery, deadline: float, begin_by: float) -> Answer:
         """Queue the query and wait for its answer, or for the client to hang up."""
-        job = self._worker.submit(query, deadline)
+        job = self._worker.submit(query, deadline, begin_by)
         answer = asyncio.wrap_future(job.future)
         answer.add_done_callback(_retrieve)  # an error that comes too late is the log's no more than the client's
         gone = asyncio.ensure_future(_hung_up(request))
