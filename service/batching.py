@@ -149,7 +149,7 @@ class PredictionWorker:
     @property
     def retry_after(self) -> int:
         """Whole seconds, 1 to 60, in which a full queue should have been worked off."""
-        return max(1, min(60, math.ceil(self.expected_wait)))
+        return _whole_seconds(self.expected_wait)
 
     def start(self) -> None:
         """Start loading."""
@@ -213,8 +213,8 @@ class PredictionWorker:
             begin_by: by when the prediction has to begin, on the same clock. After either the query is not predicted.
 
         Raises:
-            QueueFull: as many wait as may, or so many that the query would be late. A free predictor tries every query:
-                how long one takes is a guess, and only trying mends it.
+            QueueFull: as many wait as may, or so many that the query would be late; it says when the same query would
+                not be. A free predictor tries every query: how long one takes is a guess, and only trying mends it.
             NotReady: loading, failed or stopped.
         """
         with self._changed:
@@ -223,11 +223,12 @@ class PredictionWorker:
             now, wait, own = time.perf_counter(), self.expected_wait, self._expected(query)
             left = min(begin_by, deadline - own) - now
             if wait > 0 and wait > left and now < min(begin_by, deadline):  # what is late already gets its 504
+                retry_after = _whole_seconds(wait - left)
                 raise QueueFull(
                     f"{len(self._jobs)} requests wait and the predictor is busy for some {wait:.1f} s; to be in time, "
                     f"this one of some {own:.1f} s would have to begin within {max(0.0, left):.1f} s; repeat it in "
-                    f"{self.retry_after} s or with a larger X-Request-Timeout.",
-                    self.retry_after,
+                    f"{retry_after} s or with a larger X-Request-Timeout.",
+                    retry_after,
                 )
             job = Job(query, min(deadline, begin_by))
             self._jobs.append(job)
@@ -305,6 +306,10 @@ class PredictionWorker:
                 share = max(taken, 1e-6) * seconds / sum(expected)
                 before = self._seconds.setdefault(_size(job.query), share)
                 self._seconds[_size(job.query)] = before + 0.2 * (share - before)
+
+
+def _whole_seconds(seconds: float) -> int:
+    return max(1, min(60, math.ceil(seconds)))
 
 
 def _size(query: GraspQuery) -> int:
