@@ -35,7 +35,7 @@ from service.errors import (
 )
 from service.grasps import Asked, GraspEndpoint, Reader, check_model, refuse_compressed
 from service.openapi import problems
-from service.payloads import JSON, OCTET_STREAM, Payload, build_query, parse_options
+from service.payloads import JSON, OCTET_STREAM, Payload, build_query, media_type, parse_options
 from service.payloads.json_body import object_error, points_of_json
 from service.payloads.options import json_text, option_texts, raw_object, raw_values
 from service.payloads.payload import Points, as_float32, check_count, refuse_empty
@@ -228,6 +228,9 @@ def _version_of_path(version: str) -> str:
 
 def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> Reader:
     refuse_compressed(request)
+    given = request.headers.get("content-type", JSON)  # which Triton's client leaves out
+    if media_type(given) not in (JSON, OCTET_STREAM):
+        raise UnknownContentType(f"Content-Type {shortened(given)} is not supported; send {JSON} or {OCTET_STREAM}.")
     if request.scope["query_string"]:
         raise Invalid("query string", "has no meaning here; options go into `parameters` of the body")
     head_length = request.headers.get(HEADER_LENGTH)

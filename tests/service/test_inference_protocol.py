@@ -226,6 +226,12 @@ def test_the_length_of_the_json_and_of_the_bytes_must_fit(
     assert answer.status_code == status, answer.text
 
 
+@pytest.mark.parametrize("content_type", ["text/plain", "application/x-npy", "application/jsonl", ""])
+def test_a_content_type_that_the_protocol_does_not_know_is_a_415(http: httpx.Client, content_type: str) -> None:
+    answer = http.post(INFER, content=json.dumps(body()), headers={"Content-Type": content_type})
+    assert (answer.status_code, "application/json or application/octet-stream" in answer.json()["error"]) == (415, True)
+
+
 def test_a_compressed_body_is_a_415_and_another_version_a_404(http: httpx.Client) -> None:
     compressed = http.post(INFER, content=b"x", headers={"Content-Encoding": "gzip"})
     assert (compressed.status_code, "gzip" in compressed.json()["error"]) == (415, True)
