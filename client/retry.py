@@ -21,7 +21,7 @@ class RetryPolicy:
     Args:
         max_retries: tries after the first.
         first_delay: seconds before the first retry; doubles with each one.
-        max_delay: seconds that no wait exceeds, not even one that the service asks for.
+        max_delay: seconds that no wait of the client's own exceeds; the service's `Retry-After` may be longer.
     """
 
     max_retries: int = 2
@@ -44,15 +44,13 @@ class RetryPolicy:
             retries: retries already made.
             remaining: seconds left of the caller's timeout; a wait that would use them up is not begun.
             jitter: uniform in [0, 1); spreads clients that failed together over the upper half of the wait.
-            retry_after: the wait that the service asked for, which is then never shortened.
+            retry_after: seconds that the service asked to wait, which are never shortened.
         """
         if retries >= self.max_retries:
             return None
         if retry_after is None:
             ceiling = min(self.max_delay, self.first_delay * 2.0**retries)
             wait = ceiling * (0.5 + 0.5 * jitter)
-        elif retry_after > self.max_delay:
-            return None
         else:
             wait = retry_after + self.first_delay * jitter
         return wait if wait < remaining else None

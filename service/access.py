@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import hmac
-from collections.abc import Sequence
+from collections.abc import Iterable, Sequence
 from hashlib import sha256
 
 from starlette.datastructures import Headers
@@ -44,7 +44,7 @@ class AccessMiddleware:
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
-        if scope["type"] != "http" or scope["path"] in OPEN_PATHS or self._knows(_key_of(Headers(scope=scope))):
+        if scope["type"] != "http" or scope["path"] in OPEN_PATHS or self._knows(_keys_of(Headers(scope=scope))):
             await self._app(scope, receive, send)
         else:
             error = Unauthorized(
@@ -52,15 +52,16 @@ class AccessMiddleware:
             )
             await problem_response(error, scope)(scope, receive, send)
 
-    def _knows(self, key: str) -> bool:
-        """Compared with every key in full, so that the time taken tells nothing of any."""
-        given = _digest(key)
-        return sum(hmac.compare_digest(given, known) for known in self._digests) > 0
+    def _knows(self, given: Iterable[str]) -> bool:
+        """Each compared with every key in full, so that the time taken tells nothing of any."""
+        digests = [_digest(key) for key in given]
+        return sum(hmac.compare_digest(digest, known) for digest in digests for known in self._digests) > 0
 
 
-def _key_of(headers: Headers) -> str:
+def _keys_of(headers: Headers) -> list[str]:
+    """What may be a key: `Authorization` can be meant for a proxy on the way, so it does not hide `X-API-Key`."""
     scheme, _, credentials = headers.get("authorization", "").partition(" ")
-    return credentials.strip() if scheme.lower() == "bearer" else headers.get("x-api-key", "")
+    return [credentials.strip() if scheme.lower() == "bearer" else "", headers.get("x-api-key", "")]
 
 
 def _digest(key: str) -> bytes:

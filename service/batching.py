@@ -28,6 +28,9 @@ log = logging.getLogger(__name__)
 
 State = Literal["loading", "ready", "failed", "stopped"]
 
+FIRST_GUESS_S = 0.1
+"""Seconds that a prediction should take before any was measured."""
+
 
 class Predictor(Protocol):
     """What the service needs of `tesnet.predictor.GraspPredictor`."""
@@ -106,8 +109,8 @@ class PredictionWorker:
         self._state: State = "loading"
         self._model: ModelInfo | None = None
         self._device = ""
-        self._seconds_per_job = 0.1
-        self._predicting = 0
+        self._seconds: dict[int, float] = {}  # of the latest predictions, by `_size`
+        self._free_at = 0.0  # when what is being predicted should be done, on the clock of deadlines
         self._thread = threading.Thread(target=self._run, name="predictor", daemon=True)
 
     @property
@@ -138,13 +141,15 @@ class PredictionWorker:
 
     @property
     def expected_wait(self) -> float:
-        """Seconds that a query queued now would wait, judged by how long the latest ones took."""
-        return (self.depth + self._predicting) * self._seconds_per_job
+        """Seconds that a query queued now would wait, judged by how long the latest clouds of like size took."""
+        with self._changed:
+            waiting = sum(self._expected(job.query) for job in self._jobs)
+            return max(0.0, self._free_at - time.perf_counter()) + waiting
 
     @property
     def retry_after(self) -> int:
         """Whole seconds, 1 to 60, in which a full queue should have been worked off."""
-        return max(1, min(60, math.ceil(self.expected_wait)))
+        return _whole_seconds(self.expected_wait)
 
     def start(self) -> None:
         """Start loading."""
@@ -199,28 +204,33 @@ class PredictionWorker:
                 self.retry_after,
             )
 
-    def submit(self, query: GraspQuery, deadline: float = math.inf) -> Job:
+    def submit(self, query: GraspQuery, deadline: float = math.inf, begin_by: float = math.inf) -> Job:
         """Queue a query; its future gives an `Answer`.
 
         Args:
             query: what is asked.
-            deadline: on the clock of `time.perf_counter`; after it the query is not predicted any more.
+            deadline: by when the answer is wanted, on the clock of `time.perf_counter`.
+            begin_by: by when the prediction has to begin, on the same clock. After either the query is not predicted.
 
         Raises:
-            QueueFull: as many wait as may, or so many that the query's turn would come after its deadline.
+            QueueFull: as many wait as may, or so many that the query would be late; it says when the same query would
+                not be. A free predictor tries every query: how long one takes is a guess, and only trying mends it.
             NotReady: loading, failed or stopped.
         """
         with self._changed:
             self.check_ready()
             self.check_room()
-            left, wait = deadline - time.perf_counter(), self.expected_wait
-            if self._jobs and wait > left:
+            now, wait, own = time.perf_counter(), self.expected_wait, self._expected(query)
+            left = min(begin_by, deadline - own) - now
+            if wait > 0 and wait > left and now < min(begin_by, deadline):  # what is late already gets its 504
+                retry_after = _whole_seconds(wait - left)
                 raise QueueFull(
-                    f"{len(self._jobs)} requests wait, some {wait:.1f} s of work, and this one's deadline is in "
-                    f"{max(0.0, left):.1f} s; repeat it in {self.retry_after} s or with a larger X-Request-Timeout.",
-                    self.retry_after,
+                    f"{len(self._jobs)} requests wait and the predictor is busy for some {wait:.1f} s; to be in time, "
+                    f"this one of some {own:.1f} s would have to begin within {max(0.0, left):.1f} s; repeat it in "
+                    f"{retry_after} s or with a larger X-Request-Timeout.",
+                    retry_after,
                 )
-            job = Job(query, deadline)
+            job = Job(query, min(deadline, begin_by))
             self._jobs.append(job)
             self._changed.notify()
         return job
@@ -253,7 +263,7 @@ class PredictionWorker:
         """The jobs to predict together, at least one; none when the worker is to end."""
         batch: list[Job] = []
         with self._changed:
-            self._predicting = 0
+            self._free_at = 0.0
             while not batch:
                 self._changed.wait_for(lambda: self._jobs or self._state == "stopped")
                 if self._state == "stopped":
@@ -264,7 +274,7 @@ class PredictionWorker:
                         job.refuse(DeadlineExceeded("The deadline passed while the request waited for its turn."))
                     elif job.future.set_running_or_notify_cancel():
                         batch.append(job)
-            self._predicting = len(batch)
+            self._free_at = time.perf_counter() + sum(self._expected(job.query) for job in batch)
         return batch
 
     def _predict(self, predictor: Predictor, batch: list[Job]) -> None:
@@ -278,7 +288,30 @@ class PredictionWorker:
             else:
                 batch[0].future.set_exception(error)
             return
+        self._learn(batch, time.perf_counter() - started)
         for job, result in zip(batch, results, strict=True):
             job.future.set_result(Answer(result, 1e3 * (started - job.submitted), len(batch)))
-        taken = (time.perf_counter() - started) / len(batch)
-        self._seconds_per_job += (1 - 0.8 ** len(batch)) * (taken - self._seconds_per_job)
+
+    def _expected(self, query: GraspQuery) -> float:
+        """Seconds that a prediction should take: as the latest ones of the nearest size."""
+        if not self._seconds:
+            return FIRST_GUESS_S
+        return self._seconds[min(self._seconds, key=lambda known: abs(known - _size(query)))]
+
+    def _learn(self, batch: list[Job], taken: float) -> None:
+        """Note the seconds that a batch took, as a moving average; each query's share is as expected."""
+        with self._changed:
+            expected = [self._expected(job.query) for job in batch]
+            for job, seconds in zip(batch, expected, strict=True):
+                share = max(taken, 1e-6) * seconds / sum(expected)
+                before = self._seconds.setdefault(_size(job.query), share)
+                self._seconds[_size(job.query)] = before + 0.2 * (share - before)
+
+
+def _whole_seconds(seconds: float) -> int:
+    return max(1, min(60, math.ceil(seconds)))
+
+
+def _size(query: GraspQuery) -> int:
+    """The same for clouds of like size: those of 2^(n-1) to 2^n - 1 points."""
+    return len(query.points).bit_length()

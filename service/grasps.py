@@ -178,7 +178,7 @@ class GraspEndpoint:
         decoded = time.perf_counter()
         query = asked.query
         record.fields["points"] = len(query.points)
-        answer = await self._predict(request, query, min(deadline, record.arrived + asked.timeout))
+        answer = await self._predict(request, query, deadline, record.arrived + asked.timeout)
         result = answer.result
         predicted = time.perf_counter()
         timings = {
@@ -225,10 +225,11 @@ class GraspEndpoint:
 
         return read
 
-    async def _predict(self, request: Request, query: GraspQuery, deadline: float) -> Answer:
+    async def _predict(self, request: Request, query: GraspQuery, deadline: float, begin_by: float) -> Answer:
         """Queue the query and wait for its answer, or for the client to hang up."""
-        job = self._worker.submit(query, deadline)
+        job = self._worker.submit(query, deadline, begin_by)
         answer = asyncio.wrap_future(job.future)
+        answer.add_done_callback(_retrieve)  # an error that comes too late is the log's no more than the client's
         gone = asyncio.ensure_future(_hung_up(request))
         either: set[asyncio.Future[Any]] = {answer, gone}
         try:
@@ -285,6 +286,12 @@ def check_model(options: GraspOptions, loaded: ModelInfo) -> None:
     """
     if options.model != loaded.name:
         raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {loaded.name}")
+
+
+def _retrieve(answer: asyncio.Future[Answer]) -> None:
+    """Look at an answer's error, so that asyncio does not report one that nobody waits for any more."""
+    if not answer.cancelled():
+        answer.exception()
 
 
 async def _hung_up(request: Request) -> None:

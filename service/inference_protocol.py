@@ -9,7 +9,7 @@ from __future__ import annotations
 
 import math
 import re
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Mapping
 from typing import Any
 
 import msgspec
@@ -35,9 +35,18 @@ from service.errors import (
 )
 from service.grasps import Asked, GraspEndpoint, Reader, check_model, refuse_compressed
 from service.openapi import problems
-from service.payloads import JSON, OCTET_STREAM, Payload, build_query, parse_options
-from service.payloads.json_body import object_error, points_of_json
-from service.payloads.options import json_text, option_texts, raw_object, raw_values
+from service.payloads import JSON, OCTET_STREAM, Payload, build_query, media_type, parse_options
+from service.payloads.json_body import points_of_json
+from service.payloads.json_object import (
+    Span,
+    broken_chunk,
+    members,
+    number_chunks,
+    only_element,
+    refuse_twice,
+    undecodable,
+)
+from service.payloads.options import json_text, option_texts, unknown_option
 from service.payloads.payload import Points, as_float32, check_count, refuse_empty
 from service.schemas import GraspOptions
 from service.settings import Settings, service_version
@@ -67,8 +76,6 @@ _UNSUPPORTED = ("priority", "sequence_id", "sequence_start", "sequence_end")
 """What else Triton's clients can send for its schedulers."""
 _MAX_FIELD_BYTES = 65_536
 """JSON text of `id` and of `outputs`."""
-_CHUNK = 1 << 17
-"""Bytes of numbers decoded in one go, some milliseconds."""
 
 
 class _InputParameters(msgspec.Struct, forbid_unknown_fields=True):
@@ -76,10 +83,11 @@ class _InputParameters(msgspec.Struct, forbid_unknown_fields=True):
 
 
 class _Input(msgspec.Struct, forbid_unknown_fields=True):
+    """An input, but for its data."""
+
     name: str
     shape: tuple[int, int]
     datatype: str
-    data: msgspec.Raw | msgspec.UnsetType = msgspec.UNSET
     parameters: _InputParameters | None = None
 
 
@@ -92,8 +100,8 @@ class _Output(msgspec.Struct, forbid_unknown_fields=True):
     parameters: _OutputParameters | None = None
 
 
-_REQUEST = raw_object(_FIELDS)
-_PARAMETERS = raw_object((*GraspOptions.model_fields, _BINARY_OUTPUT, _TIMEOUT, *_UNSUPPORTED))
+_PARAMETERS = (*GraspOptions.model_fields, _BINARY_OUTPUT, _TIMEOUT, *_UNSUPPORTED)
+_NESTED = re.compile(rb"\[\s*\[")
 _NUMBERS = msgspec.json.Decoder(list[float])
 
 
@@ -228,6 +236,9 @@ def _version_of_path(version: str) -> str:
 
 def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> Reader:
     refuse_compressed(request)
+    given = request.headers.get("content-type", JSON)  # which Triton's client leaves out
+    if media_type(given) not in (JSON, OCTET_STREAM):
+        raise UnknownContentType(f"Content-Type {shortened(given)} is not supported; send {JSON} or {OCTET_STREAM}.")
     if request.scope["query_string"]:
         raise Invalid("query string", "has no meaning here; options go into `parameters` of the body")
     head_length = request.headers.get(HEADER_LENGTH)
@@ -240,14 +251,14 @@ def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> R
         head = len(body) if head_length is None else int(head_length)
         if head > len(body):
             raise Undecodable(f"{HEADER_LENGTH} is {head}, but the body has {len(body)} bytes; it was cut off.")
-        fields = _fields(bytes(memoryview(body)[:head]))
-        parameters = _parameters(fields.get("parameters", memoryview(b"{}")))
+        fields = _given(members(Span(body, 0, head), "inference request", _FIELDS, _unknown_field))
+        parameters = _parameters(fields.get("parameters"), settings.max_points)
         all_binary = parameters.pop(_BINARY_OUTPUT, b"false")
         if all_binary not in (b"true", b"false"):
             raise Invalid(_BINARY_OUTPUT, f"is {shortened(all_binary.decode())}; give true or false")
         timeout = _timeout(parameters.pop(_TIMEOUT, None))
         outputs = _outputs(fields.get("outputs"), all_binary == b"true")
-        identity = _bounded(fields.get("id", memoryview(b'""')), "id", str)
+        identity = _bounded(fields["id"], "id", str) if "id" in fields else ""
         points = _points(fields.get("inputs"), memoryview(body)[head:], settings.max_points)
         options = parse_options(parameters, settings.max_points)
         check_model(options, worker.model)
@@ -263,38 +274,35 @@ def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> R
     return read
 
 
-def _fields(head: bytes) -> dict[str, memoryview]:
-    """The JSON text of each field of an inference request."""
-    try:
-        return _given(raw_values(_REQUEST.decode(head)))
-    except msgspec.ValidationError as error:
-        raise Invalid("body", f"is no inference request ({shortened(str(error))}); fields: {_FIELDS}") from None
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise Undecodable(
-            f"The JSON cannot be read ({shortened(str(error))}); where binary tensors follow it, {HEADER_LENGTH} must "
-            "tell its length."
-        ) from None
-
-
-def _given(values: Mapping[str, memoryview]) -> dict[str, memoryview]:
+def _given(values: Mapping[str, Span]) -> dict[str, Span]:
     """The values but for nulls, which are as good as left out."""
-    return {name: text for name, text in values.items() if bytes(text[:5]) != b"null"}
+    return {name: text for name, text in values.items() if bytes(text.view[:5]) != b"null"}
 
 
-def _parameters(text: memoryview) -> dict[str, bytes]:
+def _unknown_field(name: str) -> Invalid:
+    return Invalid("body", f"has a field {shortened(name)}, which there is not; fields: {', '.join(_FIELDS)}")
+
+
+def _no_part_of_input(name: str) -> Invalid:
+    return Invalid("inputs", f"have a field {shortened(name)}; give one of {INPUT.name} {INPUT.datatype} {INPUT.shape}")
+
+
+def _parameters(text: Span | None, max_indices: int) -> dict[str, bytes]:
     """Options, and `binary_data_output`, as JSON text."""
-    try:
-        values = _given(raw_values(_PARAMETERS.decode(text)))
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise object_error(bytes(text), error, '{"max_grasps": 5, ...}', "parameters") from None
+    values = {} if text is None else _given(members(text, "parameters", _PARAMETERS, unknown_option))
     for name in values:
         if name in _UNSUPPORTED:
             raise Invalid(name, "is not supported: requests are answered in the order in which they come; leave it out")
-    texts = option_texts(values)
-    return {
-        name: json_text(name, msgspec.json.decode(value, type=str).encode()) if value[:1] == b'"' else value
-        for name, value in texts.items()
-    }
+    texts = option_texts(values, max_indices)
+    return {name: _unquoted(name, value) if value[:1] == b'"' else value for name, value in texts.items()}
+
+
+def _unquoted(name: str, text: bytes) -> bytes:
+    """The JSON text that a string holds."""
+    try:
+        return json_text(name, msgspec.json.decode(text, type=str).encode())
+    except (msgspec.DecodeError, UnicodeError) as error:
+        raise undecodable(name, text, error) from None
 
 
 def _timeout(text: bytes | None) -> float:
@@ -310,7 +318,7 @@ def _timeout(text: bytes | None) -> float:
     return int(text) / 1e6 or math.inf
 
 
-def _bounded(text: memoryview, name: str, kind: Any) -> Any:
+def _bounded(text: Span, name: str, kind: Any) -> Any:
     """A small field's value.
 
     Raises:
@@ -319,12 +327,14 @@ def _bounded(text: memoryview, name: str, kind: Any) -> Any:
     if len(text) > _MAX_FIELD_BYTES:
         raise Invalid(name, f"has {len(text)} bytes (limit {_MAX_FIELD_BYTES}); shorten it")
     try:
-        return msgspec.json.decode(text, type=kind)
+        value = msgspec.json.decode(text.view, type=kind)
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
         raise Invalid(name, f"cannot be used: {shortened(str(error))}") from None
+    refuse_twice(bytes(text))
+    return value
 
 
-def _outputs(text: memoryview | None, all_binary: bool) -> dict[str, bool]:
+def _outputs(text: Span | None, all_binary: bool) -> dict[str, bool]:
     """The wanted outputs, each with whether it is to be binary; all of them where none is named."""
     asked: list[_Output] = [] if text is None else _bounded(text, "outputs", list[_Output])
     known = [output.name for output in OUTPUTS]
@@ -337,16 +347,14 @@ def _outputs(text: memoryview | None, all_binary: bool) -> dict[str, bool]:
     return {name: all_binary if binary is None else binary for name, binary in chosen.items()}
 
 
-def _points(text: memoryview | None, tail: memoryview, max_points: int) -> Points:
+def _points(inputs: Span | None, tail: memoryview, max_points: int) -> Points:
     """The input tensor (N, 3), from the JSON or from the bytes behind it."""
-    if text is None:
+    if inputs is None:
         raise Invalid("inputs", f"are missing; give one, {INPUT.name} {INPUT.datatype} {INPUT.shape}")
-    try:
-        (given,) = msgspec.json.decode(text, type=tuple[_Input])
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise Invalid(
-            "inputs", f"cannot be used ({shortened(str(error))}); give one, {INPUT.name} {INPUT.datatype} {INPUT.shape}"
-        ) from None
+    fields = members(only_element(inputs, "inputs"), "inputs", (*_Input.__struct_fields__, "data"), _no_part_of_input)
+    data = fields.pop("data", None)
+    rest = msgspec.json.encode({name: msgspec.Raw(text.view) for name, text in fields.items()})
+    given: _Input = _bounded(Span.of(rest), "inputs", _Input)
     if (given.name, given.datatype) != (INPUT.name, INPUT.datatype):
         what = shortened(f"{given.name} of {given.datatype}")
         raise Invalid("inputs", f"hold {what}; give {INPUT.name} of {INPUT.datatype}")
@@ -355,14 +363,13 @@ def _points(text: memoryview | None, tail: memoryview, max_points: int) -> Point
         raise Invalid("inputs", f"have shape [{count}, {width}]; give [N, 3]")
     check_count(count, max_points)
     size = given.parameters.binary_data_size if given.parameters else None
-    if (size is None) == (given.data is msgspec.UNSET):
-        raise Invalid("inputs", "need either data or the parameter binary_data_size")
-    if size is not None:
+    if size is not None and data is None:
         return _binary_points(tail, count, size)
+    if size is not None or data is None:
+        raise Invalid("inputs", "need either data or the parameter binary_data_size")
     if len(tail):
         raise Undecodable(f"{len(tail)} bytes follow the JSON, which announces no binary tensor.")
-    assert isinstance(given.data, msgspec.Raw)
-    points = _json_points(memoryview(given.data), max_points)
+    points = _json_points(data, max_points)
     if len(points) != count:
         raise Invalid("inputs", f"have {len(points)} points of data; the shape says {count}")
     return points
@@ -377,29 +384,23 @@ def _binary_points(tail: memoryview, count: int, size: int) -> Points:
     return np.frombuffer(tail, "<f4").reshape(-1, 3)
 
 
-def _json_points(text: memoryview, max_points: int) -> Points:
+def _json_points(data: Span, max_points: int) -> Points:
     """(N, 3) of an array of triples, or of their numbers in a row."""
-    flat = bytes(text)
-    if re.match(rb"\s*\[\s*\[", flat):
-        return points_of_json(text, max_points)
-    check_count(math.ceil(flat.count(b",") / 3), max_points)
+    if _NESTED.match(data.text, data.start, data.end):
+        return points_of_json(data, max_points)
+    check_count(math.ceil(data.count(b",") / 3), max_points)
+    parts = []
     try:
-        parts = [np.array(_NUMBERS.decode(chunk), np.float64) for chunk in _chunks(flat)]
+        for chunk in number_chunks(data):
+            parts.append(np.array(_NUMBERS.decode(chunk), np.float64))
     except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-        raise Invalid("inputs", f"have data that are no numbers: {shortened(str(error))}") from None
+        raise broken_chunk("inputs", data, chunk, error) or Invalid(
+            "inputs", f"have data that are no numbers: {shortened(str(error))}"
+        ) from None
     numbers = np.concatenate(parts)
     if len(numbers) % 3:
         raise Invalid("inputs", f"have {len(numbers)} numbers of data, not a multiple of 3; give x, y, z of each point")
     return as_float32(numbers.reshape(-1, 3))
-
-
-def _chunks(text: bytes) -> Iterator[bytes]:
-    """A JSON array of numbers as several; text of another form is cut where it means something else, and refused."""
-    start = 0
-    while (end := text.find(b",", start + _CHUNK)) >= 0:
-        yield (b"[" if start else b"") + text[start:end] + b"]"
-        start = end + 1
-    yield (b"[" if start else b"") + text[start:]
 
 
 def _response(

@@ -31,6 +31,7 @@ __all__ = [
     "RawOptions",
     "build_query",
     "decoder_for",
+    "media_type",
     "merged",
     "parse_options",
     "parse_query_string",
@@ -49,6 +50,12 @@ _DECODERS: Mapping[str, Decoder] = {JSON: decode_json, OCTET_STREAM: decode_octe
 CONTENT_TYPES = (*_DECODERS, MULTIPART)
 
 
+def media_type(content_type: str) -> str:
+    """What a `Content-Type` header names, without its parameters."""
+    kind, _ = parse_options_header(content_type)
+    return kind.decode("latin-1").strip().lower()
+
+
 def decoder_for(content_type: str) -> Decoder:
     """The decoder for a body of this content type.
 
@@ -56,9 +63,9 @@ def decoder_for(content_type: str) -> Decoder:
         UnknownContentType: there is none.
         Undecodable: a multipart body without a boundary.
     """
-    kind, parameters = parse_options_header(content_type)
-    name = kind.decode("latin-1").strip().lower()
+    name = media_type(content_type)
     if name == MULTIPART:
+        _, parameters = parse_options_header(content_type)
         boundary = parameters.get(b"boundary", b"")
         if not 1 <= len(boundary) <= 70:  # RFC 2046, 5.1.1
             raise Undecodable(f"The Content-Type {MULTIPART} has no boundary of 1 to 70 characters; give one.")

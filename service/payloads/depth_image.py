@@ -9,7 +9,7 @@ from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
+from PIL import Image, UnidentifiedImageError
 
 from service.errors import Invalid, TooLarge, Undecodable, shortened
 from service.payloads.options import checked
@@ -98,6 +98,10 @@ def _pixels(file: memoryview, name: str, bits: tuple[int, ...], max_pixels: int)
         with Image.open(io.BytesIO(file), formats=("PNG",)) as image:
             if image.size == (head.width, head.height):  # a second header would be expanded as it says
                 return np.array(image)
+    except UnidentifiedImageError:  # its words would name our buffer
+        raise Undecodable(
+            f"The file `{name}` is a damaged PNG (no pixels behind its head; it was cut off); save it again."
+        ) from None
     except Exception as error:  # noqa: BLE001 - a damaged image fails in many ways
         raise Undecodable(f"The file `{name}` is a damaged PNG ({shortened(str(error))}); save it again.") from None
     raise Undecodable(f"The file `{name}` is a PNG with two headers that differ; save it again.")

@@ -5,15 +5,14 @@ from __future__ import annotations
 from collections.abc import Mapping
 from typing import cast
 
-import msgspec
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
 
 from service.errors import Invalid, Undecodable, shortened
 from service.payloads.depth_image import decode_depth
-from service.payloads.json_body import object_error
+from service.payloads.json_object import Span, members
 from service.payloads.npy_body import MAGIC, decode_npy
-from service.payloads.options import json_text, merged, option_texts, raw_object, raw_values, unknown_option
+from service.payloads.options import check_length, json_text, merged, option_texts, unknown_option
 from service.payloads.payload import Payload, as_float32, refuse_empty
 from service.schemas import DepthCamera, DepthOptions
 from tesnet import formats
@@ -22,14 +21,13 @@ FILES = ("cloud", "depth", "mask")
 PARTS = frozenset((*FILES, "options", *DepthOptions.model_fields))
 """Each option may also be a part of its own."""
 
-_OPTIONS = raw_object(DepthOptions.model_fields)
-
 
 def decode_multipart(boundary: bytes, body: bytearray, max_points: int) -> Payload:
     """The cloud of a form. Each option stands in the part `options`, a JSON object, or is a part of its own."""
     refuse_empty(body)
-    parts = _split(boundary, body)
-    options = _part_options(parts)
+    spans = _split(boundary, body)
+    options = _part_options(spans, max_points)
+    parts = {name: span.view for name, span in spans.items()}
     camera = {name: options.pop(name) for name in DepthCamera.model_fields if name in options}
     given = [name for name in ("cloud", "depth") if name in parts]
     if len(given) != 1:
@@ -58,29 +56,29 @@ def _decode_cloud(file: memoryview, options: Mapping[str, bytes], max_points: in
     raise Undecodable("The file `cloud` begins like none of .npy, .ply and .pcd; send one of them.")
 
 
-def _part_options(parts: Mapping[str, memoryview]) -> dict[str, bytes]:
+def _part_options(parts: Mapping[str, Span], max_points: int) -> dict[str, bytes]:
     options: Mapping[str, bytes] = {}
     if "options" in parts:
-        text = bytes(parts["options"])
-        try:
-            options = option_texts(raw_values(_OPTIONS.decode(text)))
-        except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
-            raise object_error(text, error, 'for example {"up": [0, 0, 1]}', "options") from None
-    alone = {name: json_text(name, bytes(part)) for name, part in parts.items() if name not in (*FILES, "options")}
+        values = members(parts["options"], "options", DepthOptions.model_fields, unknown_option)
+        options = option_texts(values, max_points)
+    own = {name: part for name, part in parts.items() if name not in (*FILES, "options")}
+    for name, part in own.items():
+        check_length(name, part, max_points)
+    alone = {name: json_text(name, bytes(part)) for name, part in own.items()}
     return dict(merged(options, alone))
 
 
 # --------------------------------------------------------------------------------------------------------------- parts
 
 
-def _split(boundary: bytes, body: bytearray) -> dict[str, memoryview]:
+def _split(boundary: bytes, body: bytearray) -> dict[str, Span]:
     """The parts by name, without a copy.
 
     Raises:
         Undecodable: cut off, or no form.
         Invalid: an unknown part, or one that is given twice.
     """
-    form = _Form(memoryview(body))
+    form = _Form(body)
     parser = MultipartParser(
         boundary,
         {
@@ -106,8 +104,8 @@ def _split(boundary: bytes, body: bytearray) -> dict[str, memoryview]:
 class _Form:
     """What the parser calls: gathers names, and where each part's content lies in the body."""
 
-    def __init__(self, body: memoryview) -> None:
-        self.parts: dict[str, memoryview] = {}
+    def __init__(self, body: bytearray) -> None:
+        self.parts: dict[str, Span] = {}
         self.complete = False
         self._body = body
         self.begin_part()
@@ -146,7 +144,7 @@ class _Form:
         self._end = end
 
     def end_part(self) -> None:
-        self.parts[self._name] = self._body[self._start or 0 : self._end]
+        self.parts[self._name] = Span(self._body, self._start or 0, self._end)
 
     def end(self) -> None:
         self.complete = True

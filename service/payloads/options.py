@@ -5,14 +5,14 @@ from __future__ import annotations
 import array
 import difflib
 import re
-from collections.abc import Iterable, Iterator
 from typing import TYPE_CHECKING, TypeVar
 from urllib.parse import unquote_to_bytes
 
 import msgspec
 from pydantic import BaseModel, ValidationError
 
-from service.errors import Invalid, Undecodable, shortened
+from service.errors import Invalid, shortened
+from service.payloads.json_object import Span, broken_chunk, check_json, is_json, members, number_chunks, refuse_twice
 from service.payloads.payload import RawOptions
 from service.schemas import DepthCamera, GraspOptions, Target
 
@@ -24,10 +24,8 @@ Model = TypeVar("Model", bound=BaseModel)
 MAX_OPTIONS_BYTES = 65_536
 """JSON text of all options together, but for a target's indices."""
 
-_CHUNK = 1 << 17
-"""Bytes of indices decoded in one go: a few milliseconds."""
-
-NOT_UTF8 = "The JSON is not UTF-8; encode it so."
+_LONG_TARGET = 1 << 13
+"""Bytes of a target that pydantic decodes in one go: a few milliseconds."""
 
 
 def parse_query_string(query_string: bytes) -> RawOptions:
@@ -72,7 +70,7 @@ def parse_options(raw: RawOptions, max_indices: int | None = None) -> GraspOptio
     for name in raw:
         if name not in GraspOptions.model_fields:
             raise unknown_option(name)
-    if max_indices is None or len(raw.get("target", b"")) <= _CHUNK // 16:
+    if max_indices is None or not _is_long_target("target", raw.get("target", b"")):
         return checked(GraspOptions, raw)
     options = checked(GraspOptions, {name: value for name, value in raw.items() if name != "target"})
     return options.model_copy(update={"target": _many_indices(raw["target"], max_indices)})
@@ -91,35 +89,35 @@ def checked(model: type[Model], raw: RawOptions) -> Model:
         raise Invalid(largest, f"is too long: the options have {size} bytes (limit {MAX_OPTIONS_BYTES}); shorten them")
     text = b"{" + b",".join(b'"%b":%b' % (name.encode(), value) for name, value in given.items()) + b"}"
     try:
-        return model.model_validate_json(text)
+        options = model.model_validate_json(text)
     except ValidationError as error:
         raise _invalid_option(model, error, given) from None
+    refuse_twice(text)
+    return options
 
 
-def raw_object(names: Iterable[str]) -> msgspec.json.Decoder[msgspec.Struct]:
-    """A decoder of JSON objects that finds the extents of the values with these names.
-
-    It neither builds Python objects for them nor goes on after the first unknown name.
-    """
-    fields = [(name, msgspec.Raw | msgspec.UnsetType, msgspec.UNSET) for name in names]
-    return msgspec.json.Decoder(msgspec.defstruct("RawObject", fields, forbid_unknown_fields=True))
-
-
-def raw_values(found: msgspec.Struct) -> dict[str, memoryview]:
-    """The JSON text of each value that a `raw_object` has found."""
-    return {name: memoryview(raw) for name, raw in msgspec.structs.asdict(found).items() if raw is not msgspec.UNSET}
-
-
-def option_texts(values: Mapping[str, memoryview]) -> dict[str, bytes]:
-    """The values' JSON text.
+def option_texts(values: Mapping[str, Span], max_indices: int) -> dict[str, bytes]:
+    """The options' JSON text.
 
     Raises:
-        Undecodable: not UTF-8.
+        Undecodable: no JSON.
+        Invalid: too long; NaN or an infinity.
     """
-    texts = {name: bytes(value) for name, value in values.items()}
-    if not all(map(_is_utf8, texts.values())):
-        raise Undecodable(NOT_UTF8)
+    texts = {}
+    for name, value in values.items():
+        check_length(name, value, max_indices)
+        texts[name] = bytes(value)
+        if not _is_long_target(name, texts[name]):
+            check_json(name, texts[name])
     return texts
+
+
+def check_length(name: str, value: Span, max_indices: int) -> None:
+    """Raise `Invalid` for an option that is too long, before it is copied. A target's indices may be many."""
+    if name == "target":
+        _check_indices(value.count(b","), max_indices)
+    elif len(value) > MAX_OPTIONS_BYTES:
+        raise Invalid(name, f"is too long: it has {len(value)} bytes (limit {MAX_OPTIONS_BYTES}); shorten it")
 
 
 def json_text(name: str, value: bytes) -> bytes:
@@ -128,7 +126,7 @@ def json_text(name: str, value: bytes) -> bytes:
     Raises:
         Invalid: neither.
     """
-    if is_json(value):
+    if _is_long_target(name, value) or is_json(value):
         return value.strip()
     if re.fullmatch(rb"[A-Za-z][\w.-]*", value):
         return b'"%b"' % value
@@ -136,23 +134,6 @@ def json_text(name: str, value: bytes) -> bytes:
     raise Invalid(
         shortened(name), f"is {text}, neither JSON nor a plain word; URL-encode JSON, for example [0.3,0,0.6]"
     )
-
-
-def is_json(text: bytes) -> bool:
-    """Whether this is a JSON document in UTF-8."""
-    try:
-        msgspec.json.decode(text, type=msgspec.Raw)
-    except (msgspec.DecodeError, RecursionError):
-        return False
-    return _is_utf8(text)
-
-
-def _is_utf8(text: bytes) -> bool:
-    try:
-        text.decode("utf-8")
-    except UnicodeDecodeError:
-        return False
-    return True
 
 
 def unknown_option(name: str) -> Invalid:
@@ -191,7 +172,6 @@ def _invalid_option(model: type[BaseModel], error: ValidationError, given: RawOp
 
 # ------------------------------------------------------------------------------------------------- a target of indices
 
-_TARGET = raw_object(Target.model_fields)
 _INDICES = msgspec.json.Decoder(list[int])
 
 
@@ -199,40 +179,38 @@ def _many_indices(text: bytes, max_indices: int) -> Target | None:
     """A target that has so many indices that pydantic would keep the interpreter's lock for long.
 
     Raises:
+        Undecodable: no JSON.
         Invalid: no list of whole numbers from 0 on, or more than the limit.
     """
-    try:
-        values = raw_values(_TARGET.decode(text))
-    except msgspec.DecodeError:
-        raise Invalid(
-            "target", f"cannot be read. Expected: {GraspOptions.model_fields['target'].description}"
-        ) from None
-    written = bytes(values.get("indices", b"")).strip()
-    if "box" in values or not written.startswith(b"["):
+    values = members(Span.of(text), "target", Target.model_fields, _no_part_of_target)
+    written = values.get("indices")
+    if "box" in values or written is None or text[written.start : written.start + 1] != b"[":
         return checked(GraspOptions, {"target": text}).target
     indices = array.array("q")
     try:
-        for chunk in _chunks(written):
+        for chunk in number_chunks(written):
             numbers = _INDICES.decode(chunk)
             indices.extend(numbers)
             if min(numbers, default=0) < 0:
                 raise Invalid("target", "has a negative index; count the posted points from 0")
-            if len(indices) > max_indices:
-                raise Invalid(
-                    "target", f"has more than {max_indices} indices, which is the limit of points; send fewer"
-                )
-    except (msgspec.DecodeError, OverflowError, RecursionError):
-        raise Invalid(
+            _check_indices(len(indices), max_indices)
+    except (msgspec.DecodeError, OverflowError, RecursionError) as error:
+        raise broken_chunk("target", written, chunk, error) or Invalid(
             "target", f"has something else than whole numbers after {len(indices)} indices; give numbers of points"
         ) from None
     return Target.model_construct(box=None, indices=indices)
 
 
-def _chunks(text: bytes) -> Iterator[bytes]:
-    """A JSON array of numbers as several such arrays. What holds something else is refused when it is decoded."""
-    inside = text[1:-1]
-    start = 0
-    while (end := inside.find(b",", start + _CHUNK)) >= 0:
-        yield b"[" + inside[start:end] + b"]"
-        start = end + 1
-    yield b"[" + inside[start:] + b"]"
+def _is_long_target(name: str, text: bytes) -> bool:
+    """Whether `_many_indices` is to look at this, piece by piece."""
+    return name == "target" and len(text) > _LONG_TARGET
+
+
+def _check_indices(count: int, max_indices: int) -> None:
+    if count > max_indices:
+        raise Invalid("target", f"has more than {max_indices} indices, which is the limit of points; send fewer")
+
+
+def _no_part_of_target(name: str) -> Invalid:
+    expected = GraspOptions.model_fields["target"].description
+    return Invalid("target", f"has a name {shortened(name)}, which there is not. Expected: {expected}")

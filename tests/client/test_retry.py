@@ -25,16 +25,16 @@ def test_waits_double(retries: int, jitter: float) -> None:
     assert second == pytest.approx(2 * first)
 
 
-@given(st.floats(0, 5), JITTER)
+@given(st.floats(0, 60), JITTER)
 def test_the_wait_that_the_service_asks_for_is_never_shortened(retry_after: float, jitter: float) -> None:
     wait = RetryPolicy(max_delay=5).delay(0, 100, jitter, retry_after)
     assert wait is not None
     assert retry_after <= wait <= retry_after + 0.1
 
 
-def test_a_wait_that_is_asked_for_but_too_long_ends_the_tries() -> None:
-    assert RetryPolicy(max_delay=5).delay(0, 100, 0.0, 6.0) is None
-    assert RetryPolicy(max_delay=5).delay(0, 1.0, 0.0, 2.0) is None
+def test_a_wait_that_is_asked_for_but_longer_than_the_time_left_ends_the_tries() -> None:
+    assert RetryPolicy().delay(0, 1.0, 0.0, 2.0) is None
+    assert RetryPolicy().delay(0, 29.0, 0.0, 29.0) is None
 
 
 def test_tries_end_after_max_retries() -> None:

@@ -279,6 +279,17 @@ def test_the_deadline_shrinks_with_every_try(refusing: Refusing) -> None:
     assert all(0 < theirs < ours for ours, theirs in budgets)
 
 
+def test_the_default_client_waits_for_a_full_queue_as_long_as_its_own_time_allows(refusing: Refusing) -> None:
+    policy = client.RetryPolicy()
+    steps = ask(
+        Request("POST", "/grasps"), grasp_reply, timeout=30, policy=policy, clock=lambda: 0.7, rng=random.Random(0)
+    )
+    next(steps)
+    wait = steps.send(Answer(429, {"retry-after": "24"}, refusing(429).body))
+    assert isinstance(wait, Wait)
+    assert 24 <= wait.seconds <= 24 + policy.first_delay
+
+
 def test_a_timeout_ends_the_conversation() -> None:
     steps = ask(
         Request("GET", "/model"),

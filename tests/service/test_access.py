@@ -19,7 +19,14 @@ Serve = Callable[..., Any]
 
 BODY = np.zeros((20, 3), np.float32).tobytes()
 OCTETS = {"Content-Type": "application/octet-stream"}
-GOOD = [{"Authorization": "Bearer second-key"}, {"authorization": "bearer first-key"}, {"X-API-Key": "first-key"}]
+GOOD = [
+    {"Authorization": "Bearer second-key"},
+    {"authorization": "bearer first-key"},
+    {"X-API-Key": "first-key"},
+    {"X-API-Key": "first-key", "Authorization": "Basic cHJveHk6cGFzcw=="},
+    {"X-API-Key": "first-key", "Authorization": "Bearer of-a-proxy"},
+    {"X-API-Key": "of-a-proxy", "Authorization": "Bearer first-key"},
+]
 BAD: list[dict[str, Any]] = [
     {},
     {"Authorization": "Bearer"},
@@ -30,6 +37,7 @@ BAD: list[dict[str, Any]] = [
     {"X-API-Key": ""},
     {"X-API-Key": "first-key,second-key"},
     {"X-API-Key": b"f\xff"},
+    {"X-API-Key": "first-ke", "Authorization": "Bearer second-ke"},
 ]
 
 

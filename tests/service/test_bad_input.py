@@ -73,7 +73,7 @@ UNDECODABLE = {
     "broken UTF-8 in an option": (JSON, b'{"points": [], "unseen": "\xff"}', "UTF-8"),
     "a million brackets": (JSON, b"[" * 1_000_000, "JSON"),
     "a million brackets in points": (JSON, b'{"points": ' + b"[" * 1_000_000, "nested"),
-    "a deep closed option": (JSON, b'{"points": [], "up": ' + b"[" * 100_000 + b"]" * 100_000 + b"}", "nested"),
+    "a deep closed option": (JSON, b'{"points": [], "up": ' + b"[" * 10_000 + b"]" * 10_000 + b"}", "nested"),
     "a multiple of 4 but not of 12": (OCTETS, bytes(16), "multiple of 12"),
     "one byte": (OCTETS, b"x", "multiple of 12"),
     "no npy": (NPY, b"PK\x03\x04 this is a zip", "npy"),
@@ -116,6 +116,7 @@ INVALID_POINTS = {
     "lists as coordinates": (b'{"points": [[0, 0, [1]]]}', "point 0"),
     "NaN": (b'{"points": [[0, 0, NaN]]}', "NaN"),
     "NaN first": (b'{"points": [[NaN,0,0]]}', "NaN"),
+    "NaN far behind": (b'{"points": [' + b"[0,0,1], " * 50_000 + b"[0,0,NaN]]}", "NaN"),
     "Infinity": (b'{"points": [[0, 0, 1], [Infinity, 0, 0]]}', "infinity"),
     "-Infinity": (b'{"points": [[0, -Infinity, 0]]}', "infinity"),
     "more than a double holds": (b'{"points": [[1e400, 0, 0]]}', "point 0"),
@@ -257,6 +258,26 @@ def test_an_invalid_option_is_a_422_that_names_it_in_body_and_query_string(http:
 def test_a_bad_query_string_is_a_422(http: httpx.Client, query: str, field: str, word: str) -> None:
     answer = http.post(f"/grasps?{query}", content=np.array(TRIANGLE, np.float32).tobytes(), headers=OCTETS)
     assert problem_of(answer, 422, word).field == field
+
+
+@pytest.mark.parametrize(
+    ("option", "field"),
+    [
+        (b'"max_grasps": NaN', "max_grasps"),
+        (b'"up": [0, 0, -Infinity]', "up"),
+        (b'"target": {"indices": [NaN]}', "target"),
+        (b'"target": {"indices": [' + b"0," * 9000 + b"NaN]}", "target"),
+    ],
+    ids=["a number", "in an array", "an index", "one of many indices"],
+)
+def test_nan_in_an_option_is_a_422_that_names_the_option(http: httpx.Client, option: bytes, field: str) -> None:
+    for body in (b'{"points": [[0, 0, 1]], %b}' % option, b'{%b, "points": [[0, 0, 1]]}' % option):
+        assert problem_of(http.post("/grasps", content=body, headers=JSON), 422, "NaN").field == field
+
+
+def test_an_option_that_is_given_twice_in_json_is_a_422(http: httpx.Client) -> None:
+    answer = http.post("/grasps", content=b'{"seed": 1, "points": [[0, 0, 1]], "seed": 2}', headers=JSON)
+    assert problem_of(answer, 422, "twice").field == "seed"
 
 
 def test_an_option_in_both_places_is_a_422(http: httpx.Client) -> None:

@@ -11,6 +11,7 @@ from typing import Any
 import numpy as np
 import pytest
 
+from service import batching
 from service.batching import PredictionWorker
 from service.errors import DeadlineExceeded, NotReady, QueueFull
 from tesnet.query import GraspQuery
@@ -163,10 +164,97 @@ def test_a_query_whose_turn_would_come_after_its_deadline_is_refused_at_once(
     assert made[0].entered.acquire(timeout=30)
     worker.submit(query)
     assert worker.expected_wait > 0
-    with pytest.raises(QueueFull, match="X-Request-Timeout") as refused:
+    with pytest.raises(QueueFull, match="X-Request-Timeout"):
         worker.submit(query, deadline=time.perf_counter() + worker.expected_wait / 10)
-    assert refused.value.retry_after >= worker.expected_wait
     worker.submit(query, deadline=time.perf_counter() + 60)
+
+
+class Timed:
+    """Takes 1 s for a thousand points, on a clock that nothing else moves; holds each query at its gate."""
+
+    model: Any = "a model"
+    device = "cpu"
+    now = 0.0
+
+    def __init__(self) -> None:
+        self.gate = threading.Semaphore(0)
+        self.entered = threading.Semaphore(0)
+
+    def perf_counter(self) -> float:
+        return self.now
+
+    def warm_up(self) -> None:
+        pass
+
+    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[Any]:
+        self.entered.release()
+        assert self.gate.acquire(timeout=30)
+        self.now += sum(len(query.points) for query in queries) / 1000
+        return [None for _ in queries]
+
+
+def cloud_of(points: int) -> GraspQuery:
+    return GraspQuery(np.zeros((points, 3), np.float32))
+
+
+@pytest.fixture
+def timed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Timed, PredictionWorker]]:
+    """A worker that has predicted a cloud of 4,000 points and one of 1,000, and is predicting one of 1,000."""
+    predictor, ready = Timed(), threading.Event()
+    monkeypatch.setattr(batching, "time", predictor)
+    worker = PredictionWorker(lambda: predictor, capacity=8, on_ready=ready.set)
+    worker.start()
+    assert ready.wait(30)
+    for points in (4000, 1000):
+        job = worker.submit(cloud_of(points))
+        predictor.gate.release()
+        job.future.result(30)
+        assert predictor.entered.acquire(timeout=30)
+    worker.submit(cloud_of(1000))
+    assert predictor.entered.acquire(timeout=30)
+    yield predictor, worker
+    for _ in range(8):
+        predictor.gate.release()
+    worker.stop()
+
+
+def test_how_long_to_wait_follows_the_size_of_the_clouds_that_wait(timed: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = timed
+    assert worker.expected_wait == pytest.approx(1)
+    worker.submit(cloud_of(900))
+    worker.submit(cloud_of(700))
+    assert worker.expected_wait == pytest.approx(3)  # though the largest cloud took 4 s
+    worker.submit(cloud_of(4000))
+    assert worker.retry_after == 7
+    predictor.now += 0.5  # of the second that is being predicted
+    assert worker.expected_wait == pytest.approx(6.5)
+
+
+def test_a_query_that_would_end_after_its_deadline_is_refused_though_its_turn_would_come_before(
+    timed: tuple[Timed, PredictionWorker],
+) -> None:
+    predictor, worker = timed
+    with pytest.raises(QueueFull, match=r"busy for some 1\.0 s.*of some 4\.0 s.*within 0\.5 s"):
+        worker.submit(cloud_of(4000), deadline=predictor.now + 4.5)
+    for _ in range(4):
+        worker.submit(cloud_of(1000), deadline=predictor.now + 10)
+    with pytest.raises(QueueFull) as refused:  # 5 s of work, 4 s of its own
+        worker.submit(cloud_of(4000), deadline=predictor.now + 6.5)
+    assert refused.value.retry_after == 3  # seconds after which the same request would be in time
+
+
+def test_the_time_to_begin_by_is_that_of_the_wait_alone(timed: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = timed
+    worker.submit(cloud_of(4000), begin_by=predictor.now + 1.5)
+    with pytest.raises(QueueFull):
+        worker.submit(cloud_of(1000), begin_by=predictor.now + 4.5)
+
+
+def test_a_free_predictor_tries_a_query_that_should_take_too_long(timed: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = timed
+    predictor.now += 1  # what is being predicted should be done
+    worker.submit(cloud_of(4000), deadline=predictor.now + 0.5)
+    assert worker.depth == 1
 
 
 def test_stopping_refuses_what_waits(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:

@@ -225,6 +225,7 @@ BAD_FORMS: dict[str, tuple[dict[str, bytes], Any, int, str]] = {
     "depth of metres per count": ({"depth": DEPTH}, {**CAMERA, "depth_scale": 1}, 422, "metres"),
     "depth that is no PNG": ({"depth": b"\xff\xd8\xff\xe0 a JPEG, for example"}, CAMERA, 400, "PNG"),
     "depth of 8 bits": ({"depth": MASK}, CAMERA, 422, "8 bits"),
+    "depth cut off behind its head": ({"depth": DEPTH[:40]}, CAMERA, 400, "PNG (no pixels"),
     "depth in colours": ({"depth": png(np.zeros((4, 4, 3), np.uint8))}, CAMERA, 422, "coloured"),
     "depth cut off": ({"depth": DEPTH[:-40]}, CAMERA, 400, "damaged"),
     "depth of no pixels": ({"depth": SIGNATURE + grey_head(0, 5) + bytes(20)}, CAMERA, 400, "PNG"),

@@ -160,7 +160,15 @@ BAD: dict[str, tuple[Any, int, str]] = {
     "an option out of range": (body(parameters={"max_grasps": "0"}), 422, "max_grasps"),
     "another network": (body(parameters={"model": "gpd"}), 422, "gpd"),
     "a flag that is none": (body(parameters={"binary_data_output": 1}), 422, "true or false"),
-    "NaN": (b'{"inputs": [{"name": "points", "datatype": "FP32", "shape": [1, 3], "data": [NaN, 0, 0]}]}', 400, "JSON"),
+    "NaN": (b'{"inputs": [{"name": "points", "datatype": "FP32", "shape": [1, 3], "data": [NaN, 0, 0]}]}', 422, "NaN"),
+    "NaN in an option": (b'{"inputs": [], "parameters": {"min_score": NaN}}', 422, "min_score"),
+    "a name twice": (b'{"inputs": [], "parameters": {"seed": 1, "seed": 2}}', 422, "seed: is given twice"),
+    "inputs twice": (b'{"inputs": [], "inputs": []}', 422, "inputs: is given twice"),
+    "a broken number": (
+        b'{"inputs": [{"name": "points", "datatype": "FP32", "shape": [1, 3], "data": [0, 0, .5]}]}',
+        400,
+        "JSON",
+    ),
     "more than a float holds": ({"inputs": point(data=[1e300, 0, 0])}, 422, "infinite"),
 }
 
@@ -224,6 +232,12 @@ def test_the_length_of_the_json_and_of_the_bytes_must_fit(
     headers = {} if length is None else {HEADER_LENGTH: length or str(len(head))}
     answer = http.post(INFER, content=head + bytes(tail), headers=headers)
     assert answer.status_code == status, answer.text
+
+
+@pytest.mark.parametrize("content_type", ["text/plain", "application/x-npy", "application/jsonl", ""])
+def test_a_content_type_that_the_protocol_does_not_know_is_a_415(http: httpx.Client, content_type: str) -> None:
+    answer = http.post(INFER, content=json.dumps(body()), headers={"Content-Type": content_type})
+    assert (answer.status_code, "application/json or application/octet-stream" in answer.json()["error"]) == (415, True)
 
 
 def test_a_compressed_body_is_a_415_and_another_version_a_404(http: httpx.Client) -> None:

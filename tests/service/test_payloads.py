@@ -2,8 +2,10 @@
 
 from __future__ import annotations
 
+import contextlib
 import itertools
 import json
+import tracemalloc
 from typing import Any
 
 import numpy as np
@@ -17,11 +19,12 @@ from service.payloads import (
     Payload,
     build_query,
     decoder_for,
-    json_body,
+    json_object,
     parse_options,
     parse_query_string,
 )
 from service.payloads.json_body import decode_json
+from service.payloads.options import unknown_option
 from tesnet.errors import TesnetError, TooManyPoints
 from tesnet.geometry import Gripper
 from tesnet.query import Box, GraspQuery
@@ -36,7 +39,7 @@ def test_json_points_are_the_same_however_they_are_cut(
     cloud: list[tuple[float, float, float]], layout: tuple[str, str], chunk: int
 ) -> None:
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(json_body, "_CHUNK", chunk)
+        patch.setattr(json_object, "CHUNK", chunk)
         body = bytearray(json.dumps({"seed": 1, "points": cloud, "up": [0, 0, 1]}, separators=layout).encode())
         payload = decode_json(body, 1000)
     np.testing.assert_array_equal(payload.points, np.array(cloud, np.float32).reshape(-1, 3))
@@ -59,7 +62,7 @@ def test_json_that_is_no_cloud_is_refused_however_it_is_cut(points: Any, chunk: 
     )
     body = bytearray(json.dumps({"points": points}).encode())
     with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(json_body, "_CHUNK", chunk)
+        patch.setattr(json_object, "CHUNK", chunk)
         if triples:
             assert len(decode_json(body, 1000).points) == len(points)
         else:
@@ -91,7 +94,7 @@ def test_random_bytes_raise_nothing_but_what_the_table_of_problems_knows(body: b
 
 
 def test_a_bad_point_is_counted_from_the_start_of_the_cloud(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_body, "_CHUNK", 20)
+    monkeypatch.setattr(json_object, "CHUNK", 20)
     points: list[Any] = [[0, 0, 1]] * 50
     points[37] = [0, 0, None]
     with pytest.raises(Invalid, match="point 37"):
@@ -99,15 +102,77 @@ def test_a_bad_point_is_counted_from_the_start_of_the_cloud(monkeypatch: pytest.
 
 
 def test_decoding_stops_at_the_first_point_too_many(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(json_body, "_CHUNK", 20)
+    monkeypatch.setattr(json_object, "CHUNK", 20)
     body = bytearray(b'{"points": [' + b"[0,0,1]," * 100 + b"null]}")
     with pytest.raises(TooManyPoints, match="limit"):
         decode_json(body, 10)
 
 
-def test_the_last_of_equal_keys_counts_in_json_as_in_every_json_library() -> None:
-    payload = decode_json(bytearray(b'{"seed": 1, "points": [], "seed": 2}'), 10)
-    assert payload.options == {"seed": b"2"}
+NUMBERS = json.dumps(np.random.default_rng(0).uniform(-1, 1, (40_000, 3)).tolist()).encode()
+INDICES = json.dumps(list(range(400_000))).encode()
+
+
+@pytest.mark.parametrize(
+    ("kind", "body"),
+    [
+        ("application/json", b'{"points": %b, "seed": 1}' % NUMBERS),
+        ("application/json", b'{"points": %b}' % NUMBERS[:-1]),
+        ("application/json", b'{"points": %b, "seed": NaN}' % NUMBERS),
+        ("application/json", b'{"points": %b' % NUMBERS.replace(b"], [", b", ")),
+        ("application/json", NUMBERS),
+        ("application/json", b'{"points": [], "target": {"indices": %b}}' % INDICES),
+        ("application/json", b'{"points": [], "sed": 1, "target": {"indices": %b}}' % INDICES),
+        (
+            "multipart/form-data; boundary=b",
+            b'--b\r\nContent-Disposition: form-data; name="target"\r\n\r\n{"indices": %b}\r\n--b--\r\n' % INDICES,
+        ),
+    ],
+    ids=["points", "cut off", "NaN behind", "no triples", "no object", "indices", "unknown name", "indices in a form"],
+)
+def test_no_text_is_copied_as_a_whole(kind: str, body: bytes) -> None:
+    """A copy, and a parser that goes over everything in one call, would keep the interpreter from all other threads."""
+    text, decode = bytearray(body), decoder_for(kind)
+    with contextlib.suppress(ServiceError):
+        decode(bytearray(b"{}"), 1)  # what the first request alone takes
+    tracemalloc.start()
+    with contextlib.suppress(ServiceError):
+        parse_options(decode(text, 100_000).options, 100_000)
+    _, most = tracemalloc.get_traced_memory()
+    tracemalloc.stop()
+    assert most < len(text)
+
+
+@given(layouts, st.permutations(["points", "seed", "workspace", "unseen"]))
+def test_the_members_of_an_object_are_found_whatever_their_order_and_white_space(
+    layout: tuple[str, str], order: list[str]
+) -> None:
+    values = {
+        "points": [[0, 0, 1], [1, 0, 1]],
+        "seed": 7,
+        "workspace": {"min": [0, 0, 0], "max": [1, 1, 1]},
+        "unseen": 'a "]}" \\',
+    }
+    text = f" \n{json.dumps({name: values[name] for name in order}, separators=layout)}\t".encode()
+    found = json_object.members(json_object.Span.of(text), "body", values, unknown_option)
+    assert {name: json.loads(bytes(span)) for name, span in found.items()} == values
+    for cut in range(len(text.rstrip())):
+        with pytest.raises(ServiceError):
+            json_object.members(json_object.Span(text, 0, cut), "body", values, unknown_option)
+
+
+@pytest.mark.parametrize(
+    ("body", "name"),
+    [
+        (b'{"seed": 1, "points": [], "seed": 2}', "seed"),
+        (b'{"points": [], "points": []}', "points"),
+        (b'{"s\\u0065ed": 1, "seed": 1}', "seed"),
+        (b'{"points": [], "workspace": {"min": [0, 0, 0], "max": [1, 1, 1], "min": [0, 0, 0]}}', "min"),
+        (b'{"points": [], "target": {"indices": [0], "indices": [' + b"0," * 9000 + b"0]}}", "indices"),
+    ],
+)
+def test_a_name_that_is_given_twice_is_refused_as_in_query_strings(body: bytes, name: str) -> None:
+    with pytest.raises(Invalid, match=f"^{name}: is given twice"):
+        parse_options(decode_json(bytearray(body), 10_000).options, 10_000)
 
 
 def test_query_strings_hold_json_and_plain_words() -> None:
