@@ -13,7 +13,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.errors import Invalid, ServiceError
+from service.errors import Invalid, ServiceError, Undecodable
 from service.payloads import (
     CONTENT_TYPES,
     Payload,
@@ -106,6 +106,23 @@ def test_decoding_stops_at_the_first_point_too_many(monkeypatch: pytest.MonkeyPa
     body = bytearray(b'{"points": [' + b"[0,0,1]," * 100 + b"null]}")
     with pytest.raises(TooManyPoints, match="limit"):
         decode_json(body, 10)
+
+
+@pytest.mark.parametrize(
+    "points",
+    [
+        "[[1, 2, 0.3 4]]",
+        "[[1,2,3],[4,5,0.3\n4]]",
+        "[[1,2,3]4,[5,6,7]]",
+        "[[1,2,3],4[5,6,7]]",
+        "[[1,2,3]4]",
+        "[4[1,2,3]]",
+        "[[1,2,3],-\n[4,5,6]]",
+    ],
+)
+def test_digits_that_no_json_number_holds_are_not_joined_to_one(points: str) -> None:
+    with pytest.raises((Undecodable, Invalid)):
+        decode_json(bytearray(b'{"points": %b}' % points.encode()), 1000)
 
 
 NUMBERS = json.dumps(np.random.default_rng(0).uniform(-1, 1, (40_000, 3)).tolist()).encode()
