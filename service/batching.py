@@ -223,6 +223,8 @@ class PredictionWorker:
             now, wait, own = time.perf_counter(), self.expected_wait, self._expected(query)
             left = min(begin_by, deadline - own) - now
             if wait > 0 and wait > left and now < min(begin_by, deadline):  # what is late already gets its 504
+                if wait <= min(begin_by, deadline) - now:  # a guess at its own time, which must not refuse it for ever
+                    self._seconds[_size(query)] = 0.9 * own
                 retry_after = _whole_seconds(wait - left)
                 raise QueueFull(
                     f"{len(self._jobs)} requests wait and the predictor is busy for some {wait:.1f} s; to be in time, "

@@ -322,14 +322,17 @@ def _bounded(text: Span, name: str, kind: Any) -> Any:
     """A small field's value.
 
     Raises:
+        Undecodable: no JSON.
         Invalid: it is large, or of another type.
     """
     if len(text) > _MAX_FIELD_BYTES:
         raise Invalid(name, f"has {len(text)} bytes (limit {_MAX_FIELD_BYTES}); shorten it")
     try:
         value = msgspec.json.decode(text.view, type=kind)
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+    except msgspec.ValidationError as error:
         raise Invalid(name, f"cannot be used: {shortened(str(error))}") from None
+    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+        raise undecodable(name, text.view, error) from None
     refuse_twice(bytes(text))
     return value
 

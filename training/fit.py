@@ -96,10 +96,10 @@ def fit(
     """Trains network `name`, writes its best weights to `out` and returns its validation measures.
 
     Most candidates that the network is asked about are free of collision with the observed cloud, as in the service.
-    Its logit is the log likelihood ratio of success, that is, the log odds where half of all candidates succeed: in the
-    loss the log odds of the labels' own share of successes are added to it (logit adjustment, arXiv 2007.07314). Which
-    kind of candidate is shown more often does not bend it. After every epoch a checkpoint beside `out` lets a stopped
-    run go on.
+    Its logit is the log likelihood ratio of success, the log odds at a balanced prior: in the loss the log odds of the
+    share of successes among all labels are added to it (logit adjustment, arXiv 2007.07314). Which kind of candidate is
+    shown more often does not bend it; which was labelled more often does. After every epoch a checkpoint beside `out`
+    lets a stopped run go on.
 
     Args:
         name: of the network.

@@ -51,8 +51,9 @@ fn main() {
 fn post(url: &str, target: &str, content_type: &str, body: &[u8]) -> Outcome<(u16, String)> {
     let host = url.strip_prefix("http://").ok_or("not http://HOST:PORT")?.trim_end_matches('/');
     let address = if host.contains(':') { host.to_string() } else { format!("{host}:80") };
-    let address = address.to_socket_addrs()?.next().ok_or("no such host")?;
-    let mut connection = TcpStream::connect_timeout(&address, PATIENCE)?;
+    let mut tried = address.to_socket_addrs()?.map(|one| TcpStream::connect_timeout(&one, PATIENCE));
+    let first = tried.next().ok_or("no such host")?;
+    let mut connection = first.or_else(|error| tried.find_map(Result::ok).ok_or(error))?;
     connection.set_read_timeout(Some(PATIENCE))?;
     connection.set_write_timeout(Some(PATIENCE))?;
     let head = format!(

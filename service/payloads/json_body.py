@@ -55,27 +55,26 @@ def points_of_json(span: Span, max_points: int) -> Points:
 def _triples(text: bytes | memoryview) -> NDArray[np.float64]:
     """(N, 3) of the text of an array of triples.
 
-    Where the text has the usual white space or none, and only digits between the brackets and commas of N triples, the
-    numbers are decoded as one flat list: half the time, and no object for a point.
+    Where nothing but brackets and commas is left without the characters of numbers, and these are those of N triples,
+    the numbers are decoded as one flat list: half the time, and no object for a point. Brackets become spaces for it,
+    so that what they part stays apart.
 
     Raises:
         msgspec.DecodeError, RecursionError: it is something else; the message names the first bad element.
     """
-    if len(text) <= 2 * CHUNK:  # nothing but white space makes a chunk of triples longer
-        text = bytes(text)
-        compact = text.replace(b", ", b",")
-        if compact.startswith(b"[ ["):  # a chunk after the first
-            compact = b"[" + compact[2:]
-        marks = compact.translate(None, b"0123456789+-.eE")
-        count = len(marks) // len(b"[,,],")
-        in_rows = compact[:2] == b"[[" and compact[-2:] == b"]]" and compact.count(b"],[") == count - 1
-        if in_rows and marks == b"[" + b",".join([b"[,,]"] * count) + b"]":
-            with contextlib.suppress(msgspec.ValidationError):  # a number out of range: the other decoder says which
-                numbers = _NUMBERS.decode(b"[" + compact.translate(None, b"[]") + b"]")
-                return np.fromiter(numbers, np.float64, 3 * count).reshape(-1, 3)
+    if len(text) > 2 * CHUNK:  # nothing but white space makes a chunk of triples so long
+        return np.array(_TRIPLES.decode(text), np.float64).reshape(-1, 3)
+    text = bytes(text)
+    brackets = text.translate(None, b"0123456789+-.eE \t\r\n")
+    count = len(brackets) // len(b"[,,],")
+    if count and brackets == b"[" + b",".join([b"[,,]"] * count) + b"]":
+        with contextlib.suppress(msgspec.ValidationError):  # a number out of range: the other decoder says which
+            numbers = _NUMBERS.decode(b"[" + text.translate(_SPACES_FOR_BRACKETS) + b"]")
+            return np.fromiter(numbers, np.float64, 3 * count).reshape(-1, 3)
     return np.array(_TRIPLES.decode(text), np.float64).reshape(-1, 3)
 
 
+_SPACES_FOR_BRACKETS = bytes.maketrans(b"[]", b"  ")
 _NUMBERS = msgspec.json.Decoder(list[float])
 _TRIPLES = msgspec.json.Decoder(list[tuple[float, float, float]])
 """Stops at the first element that is not three numbers, so hostile text costs no memory."""

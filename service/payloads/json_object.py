@@ -32,8 +32,9 @@ NOT_UTF8 = "The JSON is not UTF-8; encode it so."
 _SPACE = re.compile(rb"[ \t\r\n]*")
 _NAME = re.compile(rb'"(?:[^"\\]|\\.){0,400}"', re.DOTALL)
 _SCALAR = re.compile(rb'[^ \t\r\n,:"{}\[\]]{1,1000}')
-_COMMA = re.compile(rb",")
-_ROW_END = re.compile(rb"\][ \t\r\n]*,")
+_COMMA = re.compile(rb",(?=[ \t\r\n]*[^ \t\r\n\]])")
+_ROW_END = re.compile(rb"\][ \t\r\n]*,(?=[ \t\r\n]*[^ \t\r\n\]])")
+"""Where an array may be cut: at a comma that something follows."""
 _NO_NUMBER = re.compile(rb"-?(NaN|Infinity|nan|inf)")
 
 
@@ -120,6 +121,7 @@ def only_element(span: Span, what: str) -> Span:
         element = Span(text, at, _value_end(text, at, end, what))
         if text[_after_space(text, element.end, end) : end] == b"]":
             return element
+    check_json(what, bytes(span))
     raise Invalid(what, "cannot be used: they must be an array of one object")
 
 

@@ -185,6 +185,7 @@ def _many_indices(text: bytes, max_indices: int) -> Target | None:
     values = members(Span.of(text), "target", Target.model_fields, _no_part_of_target)
     written = values.get("indices")
     if "box" in values or written is None or text[written.start : written.start + 1] != b"[":
+        check_json("target", text)
         return checked(GraspOptions, {"target": text}).target
     indices = array.array("q")
     try:

@@ -257,6 +257,21 @@ def test_a_free_predictor_tries_a_query_that_should_take_too_long(timed: tuple[T
     assert worker.depth == 1
 
 
+def test_a_wrong_guess_at_a_querys_own_time_does_not_refuse_it_for_ever(timed: tuple[Timed, PredictionWorker]) -> None:
+    """As after one slow prediction, while clouds of another size keep the predictor busy."""
+    predictor, worker = timed
+
+    def taken() -> bool:
+        try:
+            worker.submit(cloud_of(4000), deadline=predictor.now + 2)
+        except QueueFull:
+            return False
+        return True
+
+    assert not taken()
+    assert any(taken() for _ in range(20))
+
+
 def test_stopping_refuses_what_waits(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:
     running = worker.submit(query)
     assert made[0].entered.acquire(timeout=30)

@@ -169,6 +169,12 @@ BAD: dict[str, tuple[Any, int, str]] = {
         400,
         "JSON",
     ),
+    "outputs that are no JSON": (
+        json.dumps(body()).encode()[:-1] + b', "outputs": [{"name": "scores"},]}',
+        400,
+        "JSON",
+    ),
+    "inputs that are no JSON": (b'{"inputs": [{},]}', 400, "JSON"),
     "more than a float holds": ({"inputs": point(data=[1e300, 0, 0])}, 422, "infinite"),
 }
 

@@ -125,6 +125,23 @@ def test_digits_that_no_json_number_holds_are_not_joined_to_one(points: str) -> 
         decode_json(bytearray(b'{"points": %b}' % points.encode()), 1000)
 
 
+@pytest.mark.parametrize("chunk", range(1, 20))
+def test_a_comma_that_nothing_follows_is_refused_wherever_it_is_cut(
+    monkeypatch: pytest.MonkeyPatch, chunk: int
+) -> None:
+    monkeypatch.setattr(json_object, "CHUNK", chunk)
+    with pytest.raises((Undecodable, Invalid)):
+        decode_json(bytearray(b'{"points": [[1,2,3],[4,5,6], ]}'), 1000)
+    spaces = b" " * 10_000  # else a target is read in one go
+    with pytest.raises((Undecodable, Invalid)):
+        parse_options({"target": b'{"indices": [0,1, ]}' + spaces}, 1000)
+
+
+def test_a_long_target_that_is_no_json_is_undecodable_like_a_short_one() -> None:
+    with pytest.raises(Undecodable):
+        parse_options({"target": b'{"box": {"min": [0,0,0], "max": [1,1 1]}}' + b" " * 10_000}, 1000)
+
+
 NUMBERS = json.dumps(np.random.default_rng(0).uniform(-1, 1, (40_000, 3)).tolist()).encode()
 INDICES = json.dumps(list(range(400_000))).encode()
 
