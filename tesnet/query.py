@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -44,7 +45,7 @@ def _vector(field: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.
 
 def _direction(field: str, value: ArrayLike) -> NDArray[np.float64]:
     array = _vector(field, value, (3,))
-    length = float(np.linalg.norm(array))
+    length = math.hypot(*array)  # of what overflows, too
     if not 1e-6 < length < 1e6:
         raise InvalidQuery(field, f"has length {length:g}; give a direction whose length is between 1e-6 and 1e6")
     direction = array / length
