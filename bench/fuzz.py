@@ -24,7 +24,7 @@ from schemathesis.core.result import Ok
 from bench.hostile import corpus
 from bench.serve import memory_mb, running_service
 from client import GraspClient
-from simharness.server import free_port
+from simharness.play.server import free_port
 
 ANSWER_WITHIN_S = 60.0
 ALLOWED_FAILURES = (503, 504)

@@ -27,7 +27,7 @@ from bench.scene import SUPPORT_HEIGHT, UP, WORKSPACE_MAXIMUM, WORKSPACE_MINIMUM
 from bench.serve import memory_mb, running_service
 from bench.table import processor
 from client import GraspClient
-from simharness.server import free_port
+from simharness.play.server import free_port
 
 IN_FLIGHT = 4
 """Requests that keep the service busy: one is predicted while others are read, decoded or answered."""

@@ -25,7 +25,7 @@ from bench.scene import SUPPORT_HEIGHT, UP, WORKSPACE_MAXIMUM, WORKSPACE_MINIMUM
 from bench.table import processor, table
 from client import GraspClient, GraspOptions
 from client.request import points_request
-from simharness.server import free_port
+from simharness.play.server import free_port
 
 READY_WITHIN_S = 60.0
 STOPPED_WITHIN_S = 30.0

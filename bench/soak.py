@@ -10,7 +10,7 @@ from bench.load import Load, Outcome, percentiles
 from bench.serve import memory_mb, running_service
 from bench.table import processor
 from client import GraspClient
-from simharness.server import free_port
+from simharness.play.server import free_port
 
 WARM_UP_S = 120.0
 """Before memory is first read: allocators take what they need once."""

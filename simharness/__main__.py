@@ -22,20 +22,20 @@ from typing import TYPE_CHECKING, Any, get_args
 
 from tqdm import tqdm
 
-from simharness.camera import PRESETS
 from simharness.errors import RunBroken, SimError, UsageError
-from simharness.execute import Executor
-from simharness.failures import failures, failures_report, failures_table
-from simharness.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
-from simharness.metrics import summarise
-from simharness.objects import ObjectModel, SceneKind, load_object_set
-from simharness.page import page
-from simharness.photographer import attempts_to_show, keep_only, take_pictures
-from simharness.records import RoundRecord, RunSettings
-from simharness.replay import find_attempt, replay
-from simharness.report import package_versions, percent, report, table
-from simharness.robustness import AXIS_NAMES, JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
-from simharness.run import Hooks, Run, run
+from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
+from simharness.play.metrics import summarise
+from simharness.play.photographer import attempts_to_show, keep_only, take_pictures
+from simharness.play.records import RoundRecord, RunSettings
+from simharness.play.replay import find_attempt, replay
+from simharness.play.run import Hooks, Run, run
+from simharness.report.causes import failures, failures_report, failures_table
+from simharness.report.page import page
+from simharness.report.report import package_versions, percent, report, table
+from simharness.report.robustness import AXIS_NAMES, JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
+from simharness.sim.camera import PRESETS
+from simharness.sim.execute import Executor
+from simharness.sim.objects import ObjectModel, SceneKind, load_object_set
 
 if TYPE_CHECKING:
     from typing_extensions import Self
@@ -110,7 +110,7 @@ def _clear(options: argparse.Namespace, settings: RunSettings, folder: RunFolder
         event = None
         if options.watch:
             # viser is needed for --watch alone.
-            from simharness.watch import Watcher  # noqa: PLC0415
+            from simharness.report.watch import Watcher  # noqa: PLC0415
 
             watcher = stack.enter_context(Watcher(options.watch_port))
             print(f"watch: {watcher.url}", file=sys.stderr, flush=True)

@@ -9,8 +9,8 @@ from collections.abc import Sequence
 from pathlib import Path
 from typing import get_args
 
-from simharness.camera import Preset
 from simharness.errors import SimError
+from simharness.sim.camera import Preset
 from tesnet.errors import TesnetError
 from training.archive import is_archive, pack, unpack
 from training.evaluate import evaluate

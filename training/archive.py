@@ -19,11 +19,11 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from simharness.camera import PRESET_NOISE, Preset, observe_from, sample_camera
-from simharness.crew import Emit, Work, crew
-from simharness.objects import ObjectModel, load_object_set
-from simharness.scene import restore_scene
-from simharness.world import World
+from simharness.play.crew import Emit, Work, crew
+from simharness.sim.camera import PRESET_NOISE, Preset, observe_from, sample_camera
+from simharness.sim.objects import ObjectModel, load_object_set
+from simharness.sim.scene import restore_scene
+from simharness.sim.world import World
 from tesnet import cloud
 from tesnet.candidates import grasp_poses
 from tesnet.cloud import nearest_neighbours

@@ -23,13 +23,13 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from simharness.camera import Observation, Preset, observe
-from simharness.crew import Done, Emit, Work, crew
-from simharness.execute import label_strict, snapshot_of
-from simharness.hand import Hand
-from simharness.objects import ObjectModel, load_object_set
-from simharness.scene import PERCEPTION_BOX, TABLE_HEIGHT, describe, make_scene
-from simharness.world import World
+from simharness.play.crew import Done, Emit, Work, crew
+from simharness.sim.camera import Observation, Preset, observe
+from simharness.sim.execute import label_strict, snapshot_of
+from simharness.sim.hand import Hand
+from simharness.sim.objects import ObjectModel, load_object_set
+from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT, describe, make_scene
+from simharness.sim.world import World
 from tesnet import candidates, cloud, networks
 from tesnet.collision import in_collision
 from tesnet.geometry import PANDA

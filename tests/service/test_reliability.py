@@ -22,7 +22,7 @@ from numpy.typing import NDArray
 
 from client import GraspClient
 from client.retry import RetryPolicy
-from simharness.server import free_port
+from simharness.play.server import free_port
 
 Cloud = NDArray[np.float32]
 Eventually = Callable[[Callable[[], bool]], None]

@@ -12,7 +12,7 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simharness.records import AttemptRecord, Latency, NoGraspRecord, RoundEnd, RoundRecord, RunSettings
+from simharness.play.records import AttemptRecord, Latency, NoGraspRecord, RoundEnd, RoundRecord, RunSettings
 
 STUB = Path(__file__).with_name("stub_service.py")
 

@@ -20,8 +20,8 @@ import pytest
 
 from simharness.__main__ import main
 from simharness.errors import RunBroken
-from simharness.records import TIMING_KEYS
-from simharness.server import LocalService, free_port
+from simharness.play.records import TIMING_KEYS
+from simharness.play.server import LocalService, free_port
 
 pytestmark = pytest.mark.sim
 
@@ -320,7 +320,7 @@ def test_the_service_is_started_and_stopped(
 def test_the_service_ends_when_the_harness_is_killed(stub_command: tuple[str, ...], tmp_path: Path) -> None:
     script = (
         "import sys, time, pathlib\n"
-        "from simharness.server import LocalService\n"
+        "from simharness.play.server import LocalService\n"
         "with LocalService('tesnet', pathlib.Path(sys.argv[1]), tuple(sys.argv[2:])) as service:\n"
         "    print(service.url, flush=True)\n"
         "    time.sleep(600)\n"
@@ -351,7 +351,7 @@ def test_another_port_is_tried_when_one_was_taken_meanwhile(
         taken.bind(("127.0.0.1", 0))
         taken.listen()
         ports = [taken.getsockname()[1], free_port()]
-        monkeypatch.setattr("simharness.server.free_port", functools.partial(ports.pop, 0))
+        monkeypatch.setattr("simharness.play.server.free_port", functools.partial(ports.pop, 0))
         # The service finds out whether the port is free before it loads anything; the stub serves where it is.
         command = ("bash", "-c", f"{sys.executable} -c '{_LISTEN_AS_THE_SERVICE}' && exec {' '.join(stub_command)}")
         with LocalService("tesnet", tmp_path / "log", command) as service:
@@ -387,7 +387,7 @@ def test_a_service_that_cannot_start_is_reported_with_its_last_words(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
     command = (sys.executable, "-c", "raise SystemExit('weights are missing')")
-    monkeypatch.setattr("simharness.run.LocalService", functools.partial(LocalService, command=command))
+    monkeypatch.setattr("simharness.play.run.LocalService", functools.partial(LocalService, command=command))
     assert main(["--rounds", "1", "--out", str(tmp_path)]) == 3
     errors = capsys.readouterr().err
     assert "ended with code 1 before it was ready" in errors
@@ -401,7 +401,7 @@ def test_a_service_of_ours_that_dies_in_mid_run_is_reported_with_its_last_words(
     capsys: pytest.CaptureFixture[str],
 ) -> None:
     command = (*stub_command, "--nothing", "--die-after", "4")
-    monkeypatch.setattr("simharness.run.LocalService", functools.partial(LocalService, command=command))
+    monkeypatch.setattr("simharness.play.run.LocalService", functools.partial(LocalService, command=command))
     assert main(["--rounds", "50", "--workers", "1", "--out", str(tmp_path)]) == 3
     errors = capsys.readouterr().err
     assert "the service ended with code 1" in errors

@@ -1,0 +1,107 @@
+"""The harness as the service's client: an observation becomes a request, the answer a plan.
+
+It knows the service through `client` alone.
+"""
+
+from __future__ import annotations
+
+import json
+import time
+from types import TracebackType
+from typing import TYPE_CHECKING, Any
+
+import httpx
+import numpy as np
+
+from client import GraspClient, GraspClientError
+from simharness.errors import RunBroken, UsageError
+from simharness.play.records import ModelRecord
+from simharness.play.round import Plan
+from simharness.sim.camera import Observation
+from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT
+
+if TYPE_CHECKING:
+    from typing_extensions import Self
+
+UP = (0.0, 0.0, 1.0)
+REQUEST_TIMEOUT_S = 60.0
+
+
+class HttpPlanner:
+    """Plans grasps by asking a running service. A context manager that closes the connections.
+
+    Args:
+        url: where the service is.
+        model: the network to ask for.
+        max_grasps: grasps wanted for each observation.
+        transport: replaces the network, for tests.
+
+    Raises:
+        UsageError: a URL that is not http or https.
+    """
+
+    def __init__(self, url: str, model: str, max_grasps: int, transport: httpx.BaseTransport | None = None) -> None:
+        try:
+            self._client = GraspClient(url, timeout=REQUEST_TIMEOUT_S, transport=transport)
+        except GraspClientError as error:
+            raise UsageError(f"--url: {error}") from error
+        self._url = url
+        self._model = model
+        self._max_grasps = max_grasps
+
+    def __enter__(self) -> Self:
+        return self
+
+    def __exit__(
+        self, kind: type[BaseException] | None, error: BaseException | None, trace: TracebackType | None
+    ) -> None:
+        self.close()
+
+    def close(self) -> None:
+        """Close the connections."""
+        self._client.close()
+
+    def plan(self, observation: Observation, seed: int) -> Plan:
+        """Grasps in the world, best first; no request is made for a cloud without points.
+
+        Raises:
+            RunBroken: the service does not answer, or refuses what the harness sends.
+        """
+        if not len(observation.points_world):
+            return Plan.nothing("no_points_in_workspace")
+        start = time.perf_counter()
+        try:
+            reply = self._client.grasps(
+                observation.points_world,
+                viewpoint=np.asarray(observation.viewpoints).tolist(),
+                up=UP,
+                support_height=TABLE_HEIGHT,
+                workspace={"min": PERCEPTION_BOX.minimum, "max": PERCEPTION_BOX.maximum},
+                max_grasps=self._max_grasps,
+                seed=seed,
+                model=self._model,
+            )
+        except GraspClientError as error:
+            raise RunBroken(f"the service at {self._url} gave no answer: {error}") from error
+        latency_ms = 1000 * (time.perf_counter() - start)
+        response = {key: value for key, value in reply.to_dict().items() if key != "grasps"}
+        return Plan(reply.poses, reply.scores, reply.widths, latency_ms, response)
+
+    def model(self) -> tuple[ModelRecord, dict[str, Any]]:
+        """The network that answers, and the whole of the service's `/model` document.
+
+        Raises:
+            RunBroken: the service does not answer.
+            UsageError: it has no network of that name.
+        """
+        try:
+            document: dict[str, Any] = json.loads(self._client.model().text)
+        except GraspClientError as error:
+            raise RunBroken(f"the service at {self._url} gave no answer: {error}") from error
+        networks = {entry["name"]: entry for entry in document["models"]}
+        if self._model not in networks:
+            raise UsageError(
+                f"--model {self._model}: the service at {self._url} has {', '.join(networks)}; name one of these"
+            )
+        entry = networks[self._model]
+        return ModelRecord(entry["name"], entry["version"], entry["weights_sha256"]), document

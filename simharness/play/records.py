@@ -1,0 +1,300 @@
+"""What a run is asked to do and what it writes down: frozen values and their JSON forms.
+
+It knows neither how rounds are played nor where they are written.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import asdict, dataclass
+from typing import Any, Literal, get_args
+
+import numpy as np
+from jaxtyping import Float64
+
+from simharness.sim.camera import Preset
+from simharness.sim.execute import Executor, OutcomeKind
+from simharness.sim.objects import SceneKind
+
+RoundEnd = Literal["empty", "two_failures", "no_grasps"]
+
+FAILURE_KINDS: tuple[OutcomeKind, ...] = tuple(kind for kind in get_args(OutcomeKind) if kind != "success")
+ROUND_ENDS: tuple[RoundEnd, ...] = get_args(RoundEnd)
+
+OBJECTS_PER_ROUND = 5
+FAILURES_IN_A_ROW = 2
+NO_GRASPS_IN_A_ROW = 3
+
+TIMING_KEYS = ("latency_ms",)
+"""Keys of the JSON forms that hold measured times; everything else repeats bit for bit."""
+
+
+@dataclass(frozen=True, slots=True)
+class RunSettings:
+    """Everything that decides a run's results, apart from the model behind the service.
+
+    Args:
+        rounds: rounds for each seed.
+        seeds: run seeds; the results of several are pooled.
+        scene: how objects are placed.
+        objects: name or path of an object set.
+        exclude, only: lists of object names to leave out or to keep, or None.
+        camera: name of a camera preset.
+        noise_std, depth_noise_std: standard deviations of the noise on each coordinate of each point and on depth,
+            metres; None is the preset's own.
+        executor: how a grasp is carried out and judged.
+        model: network that the service is asked for.
+        max_grasps: grasps requested for each observation; the first is executed.
+        dex_noise: whether depth has the noise of Dex-Net 2.0; None is the preset's own.
+        polar_deg: angle of every view from straight above; None is the preset's own.
+        voxel_size: edge of the voxels that keep one point each, metres; None keeps every point.
+    """
+
+    rounds: int
+    seeds: tuple[int, ...]
+    scene: SceneKind
+    objects: str
+    exclude: str | None
+    only: str | None
+    camera: Preset
+    noise_std: float | None
+    depth_noise_std: float | None
+    executor: Executor
+    model: str
+    max_grasps: int
+    dex_noise: bool | None = None
+    polar_deg: float | None = None
+    voxel_size: float | None = None
+
+    def to_json(self) -> dict[str, Any]:
+        """The settings as JSON values."""
+        return {**asdict(self), "seeds": list(self.seeds)}
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> RunSettings:
+        """Settings from `to_json`; runs recorded before an option existed were played without it.
+
+        Raises:
+            TypeError: a field without a default is missing, or one is unknown.
+        """
+        return cls(**{**values, "seeds": tuple(values["seeds"])})
+
+
+@dataclass(frozen=True, slots=True)
+class ModelRecord:
+    """The network that answered, as the service names it."""
+
+    name: str
+    version: str
+    weights_sha256: str
+
+
+@dataclass(frozen=True, slots=True)
+class Serving:
+    """Where a run's answers came from.
+
+    Args:
+        url: the address given, or None when the harness started the service.
+        num_threads: compute threads of a service that the harness started.
+        device: the predictor's, as the service names it.
+    """
+
+    url: str | None
+    num_threads: int | None
+    device: str | None
+
+
+@dataclass(frozen=True, slots=True)
+class Latency:
+    """Times of one request, milliseconds: inside the service (None when it did not say) and as the harness saw it."""
+
+    service: float | None
+    round_trip: float
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class AttemptRecord:
+    """One grasp that was carried out.
+
+    Args:
+        seed, round, attempt, observation: which attempt this is; all but the run seed count from 0.
+        request_seed: the seed sent with the request.
+        viewpoints: camera positions in the world, metres.
+        T_world_grasp: (4, 4) pose of the TCP.
+        width: opening set before the approach, metres.
+        score: probability of success that the model gave.
+        outcome: `success` or one of FAILURE_KINDS.
+        grasped: names of the objects that were lifted.
+        objects: names of the objects that were there before.
+        contact_at_start, contact_on_way: whether the hand touched anything before closing.
+        counts: the response's counts.
+        latency: the request's times; None when the planner had no need of one.
+    """
+
+    seed: int
+    round: int
+    attempt: int
+    observation: int
+    request_seed: int
+    viewpoints: tuple[tuple[float, ...], ...]
+    T_world_grasp: Float64[np.ndarray, "4 4"]
+    width: float
+    score: float
+    outcome: OutcomeKind
+    grasped: tuple[str, ...]
+    objects: tuple[str, ...]
+    contact_at_start: bool
+    contact_on_way: bool
+    counts: Mapping[str, Any]
+    latency: Latency | None
+
+    def __post_init__(self) -> None:
+        pose = np.array(self.T_world_grasp, dtype=np.float64)
+        if pose.shape != (4, 4):
+            raise ValueError(f"T_world_grasp has shape {pose.shape}; expected (4, 4)")
+        pose.setflags(write=False)
+        object.__setattr__(self, "T_world_grasp", pose)
+
+    @property
+    def success(self) -> bool:
+        """Whether an object was lifted."""
+        return self.outcome == "success"
+
+    def to_json(self) -> dict[str, Any]:
+        """The attempt as JSON values; its position repeats the matrix's last column for readers of the file."""
+        return {
+            "seed": self.seed,
+            "round": self.round,
+            "attempt": self.attempt,
+            "observation": self.observation,
+            "outcome": self.outcome,
+            "score": self.score,
+            "grasped": list(self.grasped),
+            "objects": list(self.objects),
+            "position": self.T_world_grasp[:3, 3].tolist(),
+            "T_world_grasp": self.T_world_grasp.tolist(),
+            "width": self.width,
+            "contact_at_start": self.contact_at_start,
+            "contact_on_way": self.contact_on_way,
+            "viewpoints": [list(viewpoint) for viewpoint in self.viewpoints],
+            "request_seed": self.request_seed,
+            "counts": dict(self.counts),
+            "latency_ms": _latency_to_json(self.latency),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> AttemptRecord:
+        """An attempt from `to_json`.
+
+        Raises:
+            KeyError, TypeError, ValueError: `values` is no attempt.
+        """
+        return cls(
+            seed=values["seed"],
+            round=values["round"],
+            attempt=values["attempt"],
+            observation=values["observation"],
+            request_seed=values["request_seed"],
+            viewpoints=tuple(tuple(viewpoint) for viewpoint in values["viewpoints"]),
+            T_world_grasp=np.array(values["T_world_grasp"]),
+            width=values["width"],
+            score=values["score"],
+            outcome=values["outcome"],
+            grasped=tuple(values["grasped"]),
+            objects=tuple(values["objects"]),
+            contact_at_start=values["contact_at_start"],
+            contact_on_way=values["contact_on_way"],
+            counts=values["counts"],
+            latency=_latency_from_json(values["latency_ms"]),
+        )
+
+
+@dataclass(frozen=True, slots=True)
+class NoGraspRecord:
+    """One observation that gave no grasp: its number in the round, the service's reason, counts and times.
+
+    `latency` is None where the camera saw nothing and no request was made.
+    """
+
+    observation: int
+    reason: str
+    counts: Mapping[str, Any]
+    latency: Latency | None
+
+    def to_json(self) -> dict[str, Any]:
+        """The observation as JSON values."""
+        return {
+            "observation": self.observation,
+            "reason": self.reason,
+            "counts": dict(self.counts),
+            "latency_ms": _latency_to_json(self.latency),
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any]) -> NoGraspRecord:
+        """An observation from `to_json`.
+
+        Raises:
+            KeyError, TypeError: `values` is no such observation.
+        """
+        latency = _latency_from_json(values["latency_ms"])
+        return cls(values["observation"], values["reason"], values["counts"], latency)
+
+
+@dataclass(frozen=True, slots=True)
+class RoundRecord:
+    """One finished round.
+
+    Args:
+        seed, round: which round this is; rounds count from 0.
+        objects: names of the objects present after the scene had settled.
+        ended: why it ended.
+        attempts: in the order of execution.
+        no_grasps: observations that gave no grasp, in order.
+    """
+
+    seed: int
+    round: int
+    objects: tuple[str, ...]
+    ended: RoundEnd
+    attempts: tuple[AttemptRecord, ...]
+    no_grasps: tuple[NoGraspRecord, ...]
+
+    def to_json(self) -> dict[str, Any]:
+        """The round as JSON values, with the number of its attempts; these have lines of their own."""
+        return {
+            "seed": self.seed,
+            "round": self.round,
+            "objects": list(self.objects),
+            "ended": self.ended,
+            "attempts": len(self.attempts),
+            "no_grasps": [no_grasp.to_json() for no_grasp in self.no_grasps],
+        }
+
+    @classmethod
+    def from_json(cls, values: Mapping[str, Any], attempts: tuple[AttemptRecord, ...]) -> RoundRecord:
+        """A round from `to_json` and its attempts.
+
+        Raises:
+            KeyError, TypeError, ValueError: `values` is no round, or the attempts are not as many as it says.
+        """
+        if len(attempts) != values["attempts"]:
+            raise ValueError(f"round {values['round']} has {values['attempts']} attempts; {len(attempts)} were given")
+        if values["ended"] not in ROUND_ENDS:
+            raise ValueError(f"a round cannot end by {values['ended']!r}; valid: {', '.join(ROUND_ENDS)}")
+        return cls(
+            seed=values["seed"],
+            round=values["round"],
+            objects=tuple(values["objects"]),
+            ended=values["ended"],
+            attempts=attempts,
+            no_grasps=tuple(NoGraspRecord.from_json(entry) for entry in values["no_grasps"]),
+        )
+
+
+def _latency_to_json(latency: Latency | None) -> dict[str, float | None] | None:
+    return None if latency is None else asdict(latency)
+
+
+def _latency_from_json(values: Mapping[str, Any] | None) -> Latency | None:
+    return None if values is None else Latency(**values)

@@ -1,0 +1,236 @@
+"""A whole run: workers play rounds, this process writes them down.
+
+The service may be anywhere; with no address given, one is started for the run. Workers share nothing and each round is
+played in a world of its own, so their number changes no result.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Iterator, Sequence
+from contextlib import ExitStack, contextmanager
+from dataclasses import dataclass
+from pathlib import Path
+from tempfile import TemporaryDirectory
+from typing import Any
+
+from simharness.errors import RunBroken, SimError
+from simharness.play.crew import Crew, Done, Emit, Event, Work, crew
+from simharness.play.folder import SERVICE_LOG, RunFolder
+from simharness.play.photographer import Photographer, Picture
+from simharness.play.planner import HttpPlanner
+from simharness.play.records import ModelRecord, RoundRecord, RunSettings, Serving
+from simharness.play.round import Attempted, Observed, play_round
+from simharness.play.server import NUM_THREADS, LocalService
+from simharness.sim.objects import ObjectModel
+
+_LOOK_AFTER_SERVICE_S = 1.0
+
+_RoundKey = tuple[int, int]
+"""A run seed and a round's number."""
+
+
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run under way or over.
+
+    Args:
+        model: the network that answered; None until it was asked.
+        serving: where; None until it was asked.
+        rounds: the finished rounds by seed and number.
+        stopped_by: what broke the run off; None when it was not.
+    """
+
+    settings: RunSettings
+    workers: int
+    model: ModelRecord | None
+    serving: Serving | None
+    rounds: tuple[RoundRecord, ...]
+    stopped_by: str | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every round was played."""
+        return len(self.rounds) == len(self.settings.seeds) * self.settings.rounds
+
+
+@dataclass(frozen=True, slots=True)
+class Hooks:
+    """What a run tells its caller as it happens.
+
+    Args:
+        started: once, with the rounds that an earlier run had finished.
+        round_done: after each round.
+        event: each observation and attempt; None when nobody watches, which saves sending them.
+    """
+
+    started: Callable[[Sequence[RoundRecord]], None]
+    round_done: Callable[[RoundRecord], None]
+    event: Callable[[Observed | Attempted], None] | None = None
+
+
+def run(
+    settings: RunSettings,
+    objects: tuple[ObjectModel, ...],
+    folder: RunFolder,
+    *,
+    workers: int,
+    url: str | None,
+    ray: str | None = None,
+    resume: bool,
+    hooks: Hooks,
+) -> Run:
+    """Play every round that the folder does not hold yet; a run that breaks off comes back with what was done.
+
+    Args:
+        settings: what decides the results.
+        objects: the object set.
+        folder: where the rounds go.
+        workers: processes that play rounds.
+        ray: address of a Ray cluster that they run on; None for this machine.
+        url: the service; None starts one for the run.
+        resume: whether to continue what the folder holds.
+        hooks: who is told.
+
+    Raises:
+        UsageError: the folder, the address or the model's name cannot be used, or the recorded run was another.
+    """
+    done = {(record.seed, record.round): record for record in folder.prepare(settings, resume)}
+    todo = [
+        (seed, number) for seed in settings.seeds for number in range(settings.rounds) if (seed, number) not in done
+    ]
+    model: ModelRecord | None = None
+    serving: Serving | None = None
+    stopped_by = None
+    try:
+        if todo:
+            with ExitStack() as stack:
+                service = (
+                    stack.enter_context(LocalService(settings.model, folder.path / SERVICE_LOG))
+                    if url is None
+                    else None
+                )
+                address = service.url if service is not None else str(url)
+                with HttpPlanner(address, settings.model, settings.max_grasps) as planner:
+                    model, document = planner.model()
+                serving = Serving(url, NUM_THREADS if service is not None else None, document.get("device"))
+                folder.start(settings, model, serving)
+                hooks.started(tuple(done.values()))
+                # On a cluster nobody reaches this machine's service, so workers there have their own.
+                reached = address if ray is None else url
+                task = _Rounds(settings, objects, reached, model, hooks.event is not None)
+                rounds = stack.enter_context(crew(task, min(workers, len(todo)), ray))
+                for message in _play(rounds, todo, service):
+                    if isinstance(message, RoundRecord):
+                        folder.append(message)
+                        done[message.seed, message.round] = message
+                        hooks.round_done(message)
+                    elif isinstance(message, Picture):
+                        folder.add_picture(message.name, message.content)
+                    elif hooks.event is not None:
+                        hooks.event(message)
+        else:
+            _, model, serving = folder.read_run()
+            hooks.started(tuple(done.values()))
+    except RunBroken as error:
+        stopped_by = str(error)
+    except KeyboardInterrupt:
+        stopped_by = "interrupted"
+    records = tuple(done[key] for key in sorted(done))
+    folder.rewrite(records)
+    return Run(settings, workers, model, serving, records, stopped_by)
+
+
+@dataclass(frozen=True, slots=True)
+class _Rounds:
+    """What a worker needs to play any round.
+
+    Args:
+        settings, objects: of the run.
+        url: the service; None where each worker has one of its own.
+        model: the network that must answer.
+        watched: whether every observation and attempt is wanted.
+    """
+
+    settings: RunSettings
+    objects: tuple[ObjectModel, ...]
+    url: str | None
+    model: ModelRecord
+    watched: bool
+
+    def name(self, job: _RoundKey) -> str:
+        """A round in words."""
+        seed, number = job
+        return f"round {number} of seed {seed}"
+
+    @contextmanager
+    def begin(self) -> Iterator[Work[_RoundKey]]:
+        """A planner and what plays rounds with it.
+
+        Raises:
+            RunBroken: a service of the worker's own does not start, or serves another network.
+        """
+        photographer = Photographer(self.settings)
+        with ExitStack() as stack:
+            planner = stack.enter_context(
+                HttpPlanner(self._service(stack), self.settings.model, self.settings.max_grasps)
+            )
+            self._check(planner)
+
+            def play(job: _RoundKey, emit: Emit) -> RoundRecord:
+                def listen(event: Observed | Attempted) -> None:
+                    for picture in photographer(event):
+                        emit(picture)
+                    if self.watched:
+                        emit(event)
+
+                segmentation = self.watched or photographer.wants(*job)
+                try:
+                    return play_round(self.settings, self.objects, planner, *job, listen, segmentation=segmentation)
+                except SimError as error:
+                    raise RunBroken(f"{self.name(job)}: {error}") from error
+
+            yield play
+
+    def _service(self, stack: ExitStack) -> str:
+        """URL of the service that the worker asks."""
+        if self.url is not None:
+            return self.url
+        folder = stack.enter_context(TemporaryDirectory(prefix="simharness-"))
+        return stack.enter_context(LocalService(self.settings.model, Path(folder) / SERVICE_LOG)).url
+
+    def _check(self, planner: HttpPlanner) -> None:
+        if self.url is None and (model := planner.model()[0]) != self.model:
+            raise RunBroken(
+                f"a worker's service has another model than this machine's ({model}, here {self.model}); install the "
+                "same version and weights on every machine of the cluster"
+            )
+
+
+def _play(rounds: Crew[_RoundKey], todo: Sequence[_RoundKey], service: LocalService | None) -> Iterator[Any]:
+    """Records of the rounds, and what was emitted on the way, as they come.
+
+    Raises:
+        RunBroken: the service or a worker failed.
+    """
+    for job in todo:
+        rounds.give(job)
+    left = len(todo)
+    while left:
+        for message in _hear(rounds, service):
+            left -= isinstance(message, Done)
+            yield message.result if isinstance(message, Done) else message.content
+
+
+def _hear(rounds: Crew[_RoundKey], service: LocalService | None) -> Sequence[Event | Done[_RoundKey]]:
+    """What the workers say next.
+
+    Raises:
+        RunBroken: a worker failed, or the service, which is then the one whose last words are told.
+    """
+    try:
+        heard = rounds.hear(_LOOK_AFTER_SERVICE_S)
+    except RunBroken as error:
+        raise RunBroken((service.died if service is not None else None) or str(error)) from error
+    if not heard and service is not None and service.died is not None:
+        raise RunBroken(service.died)
+    return heard

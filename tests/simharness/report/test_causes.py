@@ -1,0 +1,114 @@
+"""Causes of failed attempts, found by playing them again."""
+
+from __future__ import annotations
+
+import json
+from collections.abc import Iterator
+from pathlib import Path
+from typing import Any
+
+import numpy as np
+import pytest
+
+from simharness.__main__ import main
+from simharness.play.folder import RunFolder
+from simharness.play.records import ModelRecord, Serving
+from simharness.play.round import Attempted, Observed, Plan, play_round
+from simharness.report.causes import examine, failures, failures_report, failures_table, place_of
+from simharness.sim.camera import Noise, Observation, observe_from
+from simharness.sim.execute import Grip, Outcome
+from simharness.sim.hand import HandContact
+from simharness.sim.objects import load_object_set
+from simharness.sim.scene import TABLE_HEIGHT, restore_scene
+from simharness.sim.world import World
+from tesnet.geometry import Pose
+
+pytestmark = pytest.mark.sim
+
+FRONT, BACK = 0.10, 0.20
+
+
+@pytest.fixture(scope="module")
+def seen() -> Iterator[tuple[Observation, int, int]]:
+    """Two boxes of 40 x 20 x 80 mm, one behind the other, seen from the side of the first; their ids."""
+    with World() as world:
+        restore_scene(world, {"kind": "packed", "objects": []}, {})
+        front, back = (
+            world.add_static_box((0.02, 0.01, 0.04), (0.15, y, TABLE_HEIGHT + 0.04), colour=(1.0, 0.0, 0.0, 1.0))
+            for y in (FRONT, BACK)
+        )
+        camera = Pose.look_at([0.15, -0.5, 0.2], [0.15, 0.15, 0.1], [0.0, 0.0, 1.0])
+        yield observe_from(world, [camera], np.random.default_rng(0), Noise(), segmentation=True), front, back
+
+
+def test_a_position_is_told_by_what_the_camera_saw_of_it(seen: tuple[Observation, int, int]) -> None:
+    view, front, back = seen
+
+    def place(x: float, y: float, z: float, body: int) -> str:
+        return place_of(np.array([x, y, z]), body, view)
+
+    assert place(0.15, FRONT - 0.01, 0.10, front) == "on a seen surface"
+    assert place(0.15, FRONT + 0.01, 0.08, front) == "behind its own front"
+    assert place(0.15, BACK - 0.01, 0.07, back) == "behind something else"
+    assert place(0.15, FRONT + 0.01, 0.0505, front) == "lower than the crop"
+    assert place(0.15, 0.29, 0.10, back) == "outside the perception box"
+    assert place(0.25, FRONT, 0.10, front) == "beside everything seen"
+
+
+def attempted(view: Observation, objects: dict[int, str], record: Any, outcome: Outcome) -> Attempted:
+    return Attempted(record, Observed(0, 0, 0, view, Plan.nothing("none"), objects), outcome)
+
+
+def test_the_evidence_of_an_attempt_becomes_its_cause(seen: tuple[Observation, int, int], make_round: Any) -> None:
+    view, front, _ = seen
+    approach, slip = make_round(0, 0, ["approach", "slip"]).attempts
+    contact = HandContact("left finger", front, (0.15, FRONT - 0.01, 0.10), 0.0001)
+    on_object = Outcome("approach", (), contact_at_start=False, contact_on_way=True, first_contact=contact)
+    found = examine(attempted(view, {front: "set/box"}, approach, on_object), 7)
+    assert found.cause == ("approach", "finger, an object on a seen surface", "never closed")
+    assert found.first_contact is not None
+    assert (found.line, found.first_contact.touched, found.first_contact.part) == (7, "set/box", "left finger")
+    assert examine(attempted(view, {}, approach, on_object), 0).cause[1] == "finger, the table"
+    for grip, closing in (
+        (Grip(frozenset(), frozenset(), empty=True), "nothing between the fingers"),
+        (Grip(frozenset({front}), frozenset(), empty=False), "touched on one side"),
+        (Grip(frozenset({front}), frozenset({front}), empty=False), "touched by both fingers"),
+    ):
+        outcome = Outcome("slip", (), contact_at_start=False, contact_on_way=False, closed=grip)
+        assert examine(attempted(view, {}, slip, outcome), 0).cause == ("slip", "none", closing)
+
+
+class Misses:
+    """First closes beside everything, then drives the hand into the table."""
+
+    def __init__(self) -> None:
+        self._heights = iter((0.45, TABLE_HEIGHT))
+
+    def plan(self, observation: Observation, seed: int) -> Plan:
+        pose = np.diag([1.0, -1.0, -1.0, 1.0])
+        pose[:3, 3] = [0.02, 0.02, next(self._heights)]
+        return Plan(pose[None], np.array([0.5]), np.array([0.08]), None, {"counts": {}})
+
+
+def test_recorded_failures_are_played_again_and_sorted(
+    make_settings: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
+) -> None:
+    settings = make_settings(rounds=1, executor="strict")
+    objects = load_object_set("procedural", "packed")
+    played = play_round(settings, objects, Misses(), 0, 0)
+    folder = RunFolder(tmp_path)
+    folder.prepare(settings, resume=False)
+    folder.start(settings, ModelRecord("tesnet", "1", "0" * 64), Serving(None, 1, "cpu"))
+    folder.append(played)
+    assert main(["failures", str(tmp_path)]) == 0
+    content = json.loads((tmp_path / "failures.json").read_text())
+    assert (content["attempts"], content["failed"], content["sorted"]) == (2, 2, 2)
+    causes = {cause["outcome"]: (cause["first_contact"], cause["closing"]) for cause in content["causes"]}
+    assert causes == {
+        "slip": ("none", "nothing between the fingers"),
+        "approach": ("finger, the table", "never closed"),
+    }
+    assert failures_table(content) in capsys.readouterr().out
+    (first,) = failures(settings, objects, folder.read_rounds(), 1)
+    assert (first.line, first.outcome, first.approach_deg) == (0, "slip", 0.0)
+    assert failures_report([first, first], 4, 3)["causes"][0]["count"] == 2

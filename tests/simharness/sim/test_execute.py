@@ -1,0 +1,190 @@
+"""Attempts: every outcome in a scene made for it, both executors, labels that agree with attempts."""
+
+from __future__ import annotations
+
+from collections.abc import Sequence
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from simharness.sim.execute import Outcome, attempt, label_candidates, label_strict, snapshot_of
+from simharness.sim.hand import MAX_WIDTH, Hand
+from simharness.sim.objects import ObjectModel
+from simharness.sim.scene import TABLE_HEIGHT, restore_scene, settle
+from simharness.sim.world import BASE_LINK, World, data_path
+
+pytestmark = pytest.mark.sim
+
+CUBE = ObjectModel("cube", data_path() / "cube_small.urdf")
+SIDE = 0.04
+MIDDLE = (0.15, 0.15)
+
+Place = tuple[float, float]
+
+
+def scene(world: World, *places: Place) -> tuple[Hand, tuple[int, ...]]:
+    """Cubes of 4 cm on the table, settled, and the hand."""
+    items = [
+        {
+            "name": "cube",
+            "scale": SIDE / 0.05,
+            "position": [x, y, TABLE_HEIGHT + SIDE / 2],
+            "quaternion_xyzw": [0, 0, 0, 1],
+        }
+        for x, y in places
+    ]
+    restored = restore_scene(world, {"kind": "packed", "objects": items}, {"cube": CUBE})
+    hand = Hand(world)
+    assert settle(world) == ()
+    return hand, tuple(item.body_id for item in restored.placed)
+
+
+def from_above(x: float = 0.15, y: float = 0.15, z: float = TABLE_HEIGHT + 0.025) -> NDArray[np.float64]:
+    """A top-down grasp that closes along y."""
+    return np.array([[1.0, 0, 0, x], [0, -1.0, 0, y], [0, 0, -1.0, z], [0, 0, 0, 1.0]])
+
+
+def from_the_side(z: float = TABLE_HEIGHT + 0.025) -> NDArray[np.float64]:
+    """A grasp of the middle that travels along +x, 10 deg downwards, and closes along y."""
+    angle = np.deg2rad(10.0)
+    travel = np.array([np.cos(angle), 0.0, -np.sin(angle)])
+    matrix = np.eye(4)
+    matrix[:3, :3] = np.stack([np.cross([0.0, 1.0, 0.0], travel), [0.0, 1.0, 0.0], travel], axis=1)
+    matrix[:3, 3] = [0.15, 0.15, z]
+    return matrix
+
+
+@pytest.mark.parametrize("executor", ["strict", "edge"])
+def test_a_good_grasp_lifts_and_removes_the_object(executor: str) -> None:
+    with World() as world:
+        hand, (cube, other) = scene(world, MIDDLE, (0.15, 0.25))
+        outcome = attempt(world, hand, from_above(), MAX_WIDTH, "strict" if executor == "strict" else "edge")
+        assert outcome == Outcome("success", (cube,), contact_at_start=False, contact_on_way=False)
+        assert world.objects == (other,)
+
+
+def test_a_contact_at_the_start_pose_is_noticed_by_the_strict_executor_only() -> None:
+    # A tall neighbour: a cube hangs where the palm appears.
+    def run(executor: str) -> Outcome:
+        with World() as world:
+            hand, _ = scene(world, MIDDLE)
+            world.add_static_box((0.02, 0.02, 0.02), (0.15, 0.2, 0.26), colour=(1.0, 1.0, 1.0, 1.0))
+            return attempt(world, hand, from_above(), MAX_WIDTH, "strict" if executor == "strict" else "edge")
+
+    strict, edge = run("strict"), run("edge")
+    assert strict.kind == "pregrasp"
+    assert strict.contact_at_start
+    assert edge.kind != "pregrasp"
+    assert edge.contact_at_start
+
+
+def test_a_contact_on_the_way_fails_under_strict_and_pushes_under_edge() -> None:
+    # The left finger comes down onto the edge of a neighbour.
+    with World() as world:
+        hand, cubes = scene(world, MIDDLE, (0.15, 0.215))
+        outcome = attempt(world, hand, from_above(), MAX_WIDTH, "strict")
+        assert outcome == Outcome("approach", (), contact_at_start=False, contact_on_way=True)
+        assert world.objects == cubes
+    with World() as world:
+        hand, _ = scene(world, MIDDLE, (0.15, 0.215))
+        outcome = attempt(world, hand, from_above(), MAX_WIDTH, "edge")
+        assert outcome.contact_on_way
+        assert outcome.kind in ("success", "slip", "drop")
+
+
+def test_the_table_counts_as_a_contact_on_the_way() -> None:
+    with World() as world:
+        hand, _ = scene(world, MIDDLE)
+        assert attempt(world, hand, from_above(z=TABLE_HEIGHT + 0.004), MAX_WIDTH, "strict").kind == "approach"
+
+
+def test_closing_beside_everything_is_a_slip() -> None:
+    with World() as world:
+        hand, cubes = scene(world, MIDDLE)
+        outcome = attempt(world, hand, from_above(x=0.25), MAX_WIDTH, "strict")
+        assert outcome == Outcome("slip", (), contact_at_start=False, contact_on_way=False)
+        assert world.objects == cubes
+
+
+def test_an_object_too_heavy_to_lift_is_dropped() -> None:
+    with World() as world:
+        hand, (cube,) = scene(world, MIDDLE)
+        world.set_dynamics(cube, BASE_LINK, mass=20.0)
+        settle(world)
+        assert attempt(world, hand, from_above(), MAX_WIDTH, "strict").kind == "drop"
+        assert world.objects == (cube,)
+
+
+def test_a_hand_that_comes_from_the_side_lifts_straight_up() -> None:
+    # Backwards along z, the cube would be dragged into the block behind the hand's fingers, and stay on the table.
+    with World() as world:
+        hand, (cube,) = scene(world, MIDDLE)
+        outcome = attempt(world, hand, from_the_side(TABLE_HEIGHT + 0.045), MAX_WIDTH, "strict")
+        assert outcome == Outcome("success", (cube,), contact_at_start=False, contact_on_way=False)
+
+
+def candidates(seed: int, count: int) -> NDArray[np.float64]:
+    """Random grasps around the scene's cubes: down to 45 deg off vertical."""
+    rng = np.random.default_rng(seed)
+    matrices = []
+    for _ in range(count):
+        tilt, azimuth, roll = rng.uniform(0, np.pi / 4), *rng.uniform(0, 2 * np.pi, size=2)
+        z = np.array([np.sin(tilt) * np.cos(azimuth), np.sin(tilt) * np.sin(azimuth), -np.cos(tilt)])
+        x = np.cross([-np.sin(azimuth), np.cos(azimuth), 0.0], z)
+        y = np.cross(z, x)
+        matrix = np.eye(4)
+        matrix[:3, 0], matrix[:3, 2] = np.cos(roll) * x + np.sin(roll) * y, z
+        matrix[:3, 1] = np.cross(z, matrix[:3, 0])
+        matrix[:3, 3] = rng.uniform([0.13, 0.13, TABLE_HEIGHT + 0.015], [0.17, 0.2, TABLE_HEIGHT + 0.06])
+        matrices.append(matrix)
+    return np.array(matrices)
+
+
+PAIR: Sequence[Place] = (MIDDLE, (0.15, 0.22))
+
+
+def test_labels_agree_with_attempts_and_do_not_depend_on_their_order() -> None:
+    grasps = candidates(0, 12)
+    widths = np.full(len(grasps), MAX_WIDTH)
+    with World() as world:
+        hand, cubes = scene(world, *PAIR)
+        with snapshot_of(world) as snapshot:
+            before = [world.position(cube) for cube in cubes]
+            labels = label_strict(world, hand, grasps, widths, snapshot)
+            assert [world.position(cube) for cube in cubes] == before
+            assert label_strict(world, hand, grasps[::-1], widths, snapshot) == labels[::-1]
+    assert len(set(labels)) >= 3
+    outcomes = []
+    for grasp in grasps:
+        with World() as world:
+            hand, _ = scene(world, *PAIR)
+            outcomes.append(attempt(world, hand, grasp, MAX_WIDTH, "strict").kind)
+    agreement = np.mean([label == outcome for label, outcome in zip(labels, outcomes, strict=True)])
+    assert agreement > 0.9
+
+
+def test_labels_for_the_edge_executor_are_paid_for_on_request() -> None:
+    grasps = candidates(1, 4)
+    widths = np.full(len(grasps), MAX_WIDTH)
+    with World() as world:
+        hand, _ = scene(world, *PAIR)
+        with snapshot_of(world) as snapshot:
+            plain = label_candidates(world, hand, grasps, widths, snapshot, edge=False)
+            both = label_candidates(world, hand, grasps, widths, snapshot, edge=True)
+    assert all(labels.edge is None for labels in plain)
+    assert [labels.strict for labels in plain] == [labels.strict for labels in both]
+    assert all(labels.edge in ("success", "slip", "drop") for labels in both)
+
+
+def test_the_same_attempts_end_the_same_to_the_bit_in_a_fresh_world() -> None:
+    def run() -> list[object]:
+        with World() as world:
+            hand, _ = scene(world, *PAIR, (0.1, 0.1))
+            record: list[object] = []
+            for grasp in candidates(2, 2):
+                record.append(attempt(world, hand, grasp, MAX_WIDTH, "edge"))
+                record += [world.pose(body).matrix.tobytes() for body in world.objects]
+            return record
+
+    assert run() == run()

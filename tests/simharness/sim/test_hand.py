@@ -1,0 +1,95 @@
+"""The hand: where its parts are, what it holds."""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+
+import numpy as np
+import pytest
+
+from simharness.sim.hand import MAX_WIDTH, Hand
+from simharness.sim.world import World
+from tesnet.geometry import HAND_TO_TCP, Pose
+
+pytestmark = pytest.mark.sim
+
+DOWN = np.diag([1.0, -1.0, -1.0])
+MARGIN = 0.001
+"""Metres by which Bullet rounds the hull of a mesh."""
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    """Nothing but gravity."""
+    with World() as world:
+        yield world
+
+
+def grasp(x: float, y: float, z: float) -> Pose:
+    return Pose(DOWN, np.array([x, y, z]))
+
+
+def test_the_hand_is_placed_by_its_tcp(world: World) -> None:
+    hand = Hand(world)
+    wanted = Pose.from_quaternion([0.3, 0.8, -0.2, 0.4], [0.1, 0.2, 0.3])
+    hand.place(wanted.matrix, 0.05)
+    np.testing.assert_allclose(hand.T_world_grasp.matrix, wanted.matrix, atol=1e-9)
+    assert hand.width == pytest.approx(0.05)
+    base = world.pose(hand.body)
+    np.testing.assert_allclose(base.translation, wanted.apply([0.0, 0.0, -HAND_TO_TCP]), atol=1e-9)
+
+
+def test_the_fingertips_are_112_mm_from_the_hands_base(world: World) -> None:
+    floor = world.add_static_box((0.5, 0.5, 0.05), (0.0, 0.0, -0.05), colour=(1.0, 1.0, 1.0, 1.0))
+    hand = Hand(world)
+    hand.place(grasp(0.0, 0.0, 0.1).matrix, MAX_WIDTH)
+    gap = world.distance(hand.body, floor, limit=0.2)
+    assert gap is not None
+    base_height = 0.1 + HAND_TO_TCP
+    assert base_height - gap == pytest.approx(0.112 + MARGIN, abs=0.0005)
+
+
+@pytest.mark.parametrize("width", [0.08, 0.04])
+def test_the_pads_stand_half_the_width_to_either_side_along_y(world: World, width: float) -> None:
+    hand = Hand(world)
+    for side in (1, -1):
+        # A thin plate across the closing direction between the pads, 2 mm inside of one of them.
+        plate = world.add_static_box(
+            (0.005, 0.0005, 0.005), (0.0, side * (width / 2 - 0.0025), 0.0), colour=(1, 1, 1, 1)
+        )
+        hand.place(grasp(0.0, 0.0, 0.0).matrix, width)
+        gap = world.distance(hand.body, plate, limit=0.1)
+        assert gap == pytest.approx(0.002 - MARGIN, abs=0.0005)
+        world.remove(plate)
+
+
+@pytest.mark.parametrize("thickness", [0.02, 0.05])
+def test_closing_on_a_box_leaves_its_thickness_as_opening(world: World, thickness: float) -> None:
+    world.add_static_box((0.03, thickness / 2, 0.03), (0.0, 0.0, 0.0), colour=(1.0, 1.0, 1.0, 1.0))
+    hand = Hand(world)
+    hand.place(grasp(0.0, 0.0, 0.02).matrix, MAX_WIDTH)
+    world.find_contacts()
+    assert not hand.touches_anything()
+    hand.close()
+    world.step(120)
+    assert hand.width == pytest.approx(thickness + 2 * MARGIN, abs=0.0005)
+    assert hand.finger_speed < 0.002
+
+
+def test_a_hand_that_closes_on_nothing_meets_itself_only(world: World) -> None:
+    hand = Hand(world)
+    hand.place(grasp(0.0, 0.0, 0.3).matrix, MAX_WIDTH)
+    hand.close()
+    world.step(120)
+    assert hand.width == pytest.approx(0.0, abs=0.001)
+    assert hand.touched(within=0.001) == (set(), set())
+
+
+def test_the_constraint_carries_the_hand_and_gravity_does_not(world: World) -> None:
+    hand = Hand(world)
+    start = grasp(0.1, 0.1, 0.3)
+    hand.place(start.matrix, MAX_WIDTH)
+    hand.hold_open(MAX_WIDTH)
+    world.step(120)
+    np.testing.assert_allclose(hand.T_world_grasp.matrix, start.matrix, atol=1e-4)
+    assert hand.width == pytest.approx(MAX_WIDTH, abs=1e-4)
