@@ -15,7 +15,6 @@ from tesnet import candidates, cloud, collision, networks, ranking, support, wei
 from tesnet.errors import DeviceError, WeightsError
 from tesnet.geometry import PANDA, GraspSet
 from tesnet.networks import Network
-from tesnet.networks.tesnet import CloudFeatures
 from tesnet.query import MAX_APPROACH_POINTS, Box, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 
@@ -162,7 +161,7 @@ class GraspPredictor:
         blocked = self._blocked(prepared, found, query)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
 
-    def _encode(self, proposals: Sequence[_Proposal]) -> list[CloudFeatures]:
+    def _encode(self, proposals: Sequence[_Proposal]) -> list[Any]:
         """The features of each proposal's cloud, whose clock is told its share of the pass."""
         if not proposals:
             return []
@@ -174,7 +173,7 @@ class GraspPredictor:
             proposal.clock.add("network", milliseconds_per_point * len(proposal.prepared))
         return features
 
-    def _rank(self, proposal: _Proposal, features: CloudFeatures) -> GraspResult:
+    def _rank(self, proposal: _Proposal, features: Any) -> GraspResult:
         """The proposal's candidates, scored and ranked; others in their place, if only those score well."""
         query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
         clock.start()
@@ -213,7 +212,7 @@ class GraspPredictor:
             timings_ms=clock.laps_ms,
         )
 
-    def _scores(self, features: CloudFeatures, prepared: cloud.PreparedCloud, found: _Found) -> torch.Tensor:
+    def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Found) -> torch.Tensor:
         a, b = self._calibration
         scores = torch.sigmoid(a * self._network.score(features, prepared, found.free) + b)
         self._synchronise()
@@ -294,11 +293,11 @@ def _further(query: GraspQuery, number: int) -> GraspQuery:
     return replace(query, num_approach_points=count, seed=(query.seed + number * _SEED_STEP) % 2**63)
 
 
-def configuration_of(network_config: Any) -> dict[str, dict[str, Any]]:
-    """The configuration that a weights file's header carries, with today's preparation and candidates."""
+def configuration_of(network: Network) -> dict[str, dict[str, Any]]:
+    """The configuration that the header of a newly trained network's weights carries, with today's candidates."""
     return {
-        "network": asdict(network_config),
-        "preparation": asdict(cloud.PreparationConfig()),
+        "network": asdict(network.config),
+        "preparation": asdict(network.preparation),
         "candidates": asdict(candidates.CandidateConfig()),
     }
 

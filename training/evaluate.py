@@ -54,7 +54,7 @@ def score_views(
     for view in views:
         which = torch.arange(len(view.outcomes)) if blocked else view.collision_free.nonzero()[:, 0]
         if len(which):
-            logits = network.score(network.encode(view.cloud), view.cloud, view.candidates.select(which))
+            logits = network.score(networks.encode(network, view.cloud), view.cloud, view.candidates.select(which))
             scored.append((logits.double().numpy(), view.success[which].numpy()))
     return scored
 

@@ -150,9 +150,7 @@ def fit(
                 "data": {"scenes": len(scene_files(data)), "views": len(train_views), "labels": labels, "prior": prior},
                 "recipe": asdict(recipe), "seed": seed, "epoch": progress.epoch, "validation": measures,
             }  # fmt: skip
-            header = weights.Header(
-                name, version, configuration_of(network.config), tuple(measures["calibration"]), training
-            )
+            header = weights.Header(name, version, configuration_of(network), tuple(measures["calibration"]), training)
             weights.save(out, network.state_dict(), header)
         _save_checkpoint(checkpoint, network, optimiser, progress)
         with out.with_suffix(".log.jsonl").open("a") as log:
@@ -229,7 +227,7 @@ def _view_loss(
     )
     target = view.success[which]
     mirror = torch.from_numpy(rng.choice([-1.0, 1.0], len(which)).astype(np.float32))
-    logits = network.score(network.encode(view.cloud), view.cloud, view.candidates.select(which), mirror)
+    logits = network.score(networks.encode(network, view.cloud), view.cloud, view.candidates.select(which), mirror)
     return functional.binary_cross_entropy_with_logits(logits + log_odds, target.float())
 
 

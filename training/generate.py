@@ -304,7 +304,7 @@ def _choose(
     mined = np.empty(0, dtype=np.int64)
     if network is not None and len(clear):
         with torch.inference_mode():
-            logits = network.score(network.encode(prepared), prepared, found.select(free))
+            logits = network.score(networks.encode(network, prepared), prepared, found.select(free))
         best = clear[logits.argsort(descending=True)[: math.ceil(len(clear) / 4)].numpy()]
         mined = rng.permutation(best)[: num_clear // 2]
     others = rng.permutation(np.setdiff1d(clear, mined))[: num_clear - len(mined)]

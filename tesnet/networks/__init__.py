@@ -1,4 +1,7 @@
-"""Networks that score candidate grasps, by name. One file each; all see the same prepared cloud and candidates."""
+"""Networks that score candidate grasps, by name. One file and one line of `NETWORKS` each.
+
+All are given the same candidates, and clouds prepared as they ask for it.
+"""
 
 from __future__ import annotations
 
@@ -8,15 +11,18 @@ from typing import Any
 
 from tesnet import weights
 from tesnet.errors import WeightsError
+from tesnet.networks.network import Network, encode
 from tesnet.networks.tesnet import TesNet, TesNetConfig
 
-Network = TesNet
-"""What scores candidates: `encode(cloud)` or `encode_batch(clouds)` once, then `score(features, cloud, candidates)`."""
+__all__ = ["NETWORKS", "Network", "build", "encode", "load"]
 
-NETWORKS: Mapping[str, tuple[type[TesNet], type[TesNetConfig]]] = {"tesnet": (TesNet, TesNetConfig)}
+NETWORKS: Mapping[str, tuple[type[Network], type[Any]]] = {
+    "tesnet": (TesNet, TesNetConfig),
+}
+"""The class of each network and of its configuration, whose fields all have defaults."""
 
 
-def build(name: str, config: Mapping[str, Any] | None = None) -> TesNet:
+def build(name: str, config: Mapping[str, Any] | None = None) -> Network:
     """A network with fresh parameters.
 
     Args:
@@ -28,7 +34,7 @@ def build(name: str, config: Mapping[str, Any] | None = None) -> TesNet:
     """
     if name not in NETWORKS:
         raise ValueError(f"unknown network {name!r}; valid: {', '.join(NETWORKS)}")
-    network, config_class = NETWORKS[name]
+    network_class, config_class = NETWORKS[name]
     given: dict[str, Any] = {
         key: tuple(value) if isinstance(value, list) else value for key, value in (config or {}).items()
     }
@@ -36,10 +42,10 @@ def build(name: str, config: Mapping[str, Any] | None = None) -> TesNet:
     unknown = sorted(set(given) - set(fields))
     if unknown:
         raise ValueError(f"unknown configuration {', '.join(unknown)} of {name}; valid: {', '.join(fields)}")
-    return network(config_class(**given))
+    return network_class(config_class(**given))
 
 
-def load(path: Path) -> tuple[TesNet, weights.Header]:
+def load(path: Path) -> tuple[Network, weights.Header]:
     """The network of a weights file, on the CPU and in evaluation mode, and the file's header.
 
     Raises:

@@ -10,12 +10,13 @@ from __future__ import annotations
 import itertools
 from collections.abc import Sequence
 from dataclasses import dataclass
+from typing import ClassVar
 
 import torch
 from torch import Tensor, nn
 
 from tesnet.candidates import Candidates
-from tesnet.cloud import PreparedCloud
+from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.collision import points_in_grasp_frames
 from tesnet.geometry import PANDA
 from tesnet.layers import PointTransformerConv, SAGEConv
@@ -169,6 +170,7 @@ class RegionPooling(nn.Module):
 class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
+    preparation: ClassVar[PreparationConfig] = PreparationConfig()
     probes: Tensor
 
     def __init__(self, config: TesNetConfig) -> None:
@@ -202,14 +204,11 @@ class TesNet(nn.Module):
             nn.Linear(config.head_channels[1], 1),
         )
 
-    def encode(self, cloud: PreparedCloud) -> CloudFeatures:
-        """Features of every point and of the whole cloud; computed once, shared by all candidates."""
-        return self.encode_batch([cloud])[0]
-
     def encode_batch(self, clouds: Sequence[PreparedCloud]) -> list[CloudFeatures]:
-        """The features of each of several clouds, in one pass over the stacked graphs of all of them.
+        """Features of every point and of the whole of each cloud, in one pass over the stacked graphs of all of them.
 
-        They equal those of `encode` up to the rounding of float32, which depends on the size of a matrix product.
+        They equal those of each cloud alone up to the rounding of float32, which depends on the size of a matrix
+        product.
         """
         all_patches = [group(cloud, self.config.patch_size) for cloud in clouds]
         lifted = torch.relu(self.lift(torch.cat([point_inputs(cloud) for cloud in clouds])))

@@ -9,9 +9,9 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from tesnet import cloud, networks
+from tesnet import cloud
 from tesnet.geometry import Pose
-from tesnet.networks import Network
+from tesnet.networks.tesnet import TesNet, TesNetConfig
 from tesnet.predictor import GraspPredictor, ModelInfo, configuration_of
 from tesnet.query import Box, GraspQuery
 
@@ -165,16 +165,16 @@ def moved_cloud(ready: cloud.PreparedCloud, motion: Pose) -> cloud.PreparedCloud
     )
 
 
-def fresh_network(seed: int = 0) -> Network:
+def fresh_network(seed: int = 0) -> TesNet:
     """TES-Net with untrained parameters, always the same for a seed."""
     with torch.random.fork_rng():
         torch.manual_seed(seed)
-        return networks.build("tesnet").eval()
+        return TesNet(TesNetConfig()).eval()
 
 
 def fresh_predictor(seed: int = 0, calibration: tuple[float, float] = (1.0, 0.0)) -> GraspPredictor:
     """A predictor with `fresh_network(seed)`."""
     network = fresh_network(seed)
-    configuration = configuration_of(network.config)
+    configuration = configuration_of(network)
     model = ModelInfo("tesnet", "0", "0" * 64, {}, configuration)
     return GraspPredictor(network, configuration, calibration, model, CPU)

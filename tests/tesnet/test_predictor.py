@@ -283,7 +283,7 @@ def test_other_candidates_are_searched_for_while_the_best_score_is_low(monkeypat
 
 def test_a_saved_network_answers_like_the_one_in_memory(tmp_path: Path) -> None:
     network = fresh_network()
-    header = weights.Header("tesnet", "3", configuration_of(network.config), (8.0, 0.5), {"seed": 7})
+    header = weights.Header("tesnet", "3", configuration_of(network), (8.0, 0.5), {"seed": 7})
     weights.save(tmp_path / "a.safetensors", network.state_dict(), header)
     loaded = GraspPredictor.load(tmp_path / "a.safetensors")
     np.testing.assert_array_equal(loaded.predict(tabletop_query()).grasps.scores, answer().grasps.scores)
@@ -305,7 +305,7 @@ def test_a_saved_network_answers_like_the_one_in_memory(tmp_path: Path) -> None:
 )
 def test_weights_of_another_network_are_refused(tmp_path: Path, name: str, change: dict[str, Any]) -> None:
     network = fresh_network()
-    configuration = configuration_of(network.config) | change
+    configuration = configuration_of(network) | change
     weights.save(tmp_path / "a.safetensors", network.state_dict(), weights.Header(name, "0", configuration))
     with pytest.raises(WeightsError, match=r"a\.safetensors"):
         GraspPredictor.load(tmp_path / "a.safetensors")
@@ -323,7 +323,7 @@ def test_the_number_of_threads_is_set_on_request(tmp_path: Path) -> None:
     weights.save(
         tmp_path / "a.safetensors",
         network.state_dict(),
-        weights.Header("tesnet", "0", configuration_of(network.config)),
+        weights.Header("tesnet", "0", configuration_of(network)),
     )
     program = (
         "import sys, torch; from pathlib import Path; from tesnet.predictor import GraspPredictor;"

@@ -3,6 +3,7 @@ from __future__ import annotations
 import numpy as np
 import torch
 
+from tesnet.networks import encode
 from tesnet.visibility import outside
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view
@@ -19,7 +20,7 @@ def turned(seed: int) -> LabelledView:
 @torch.inference_mode()
 def logits(view: LabelledView) -> torch.Tensor:
     network = fresh_network()
-    return network.score(network.encode(view.cloud), view.cloud, view.candidates)
+    return network.score(encode(network, view.cloud), view.cloud, view.candidates)
 
 
 def test_the_cloud_is_centred_and_turned_rigidly() -> None:

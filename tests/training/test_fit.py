@@ -88,7 +88,8 @@ def test_a_logit_of_zero_is_an_even_chance_at_a_balanced_prior(shown: float) -> 
     view = labelled_view(count=60, positives=round(60 * shown))
     logit = torch.zeros((), requires_grad=True)
     network = SimpleNamespace(
-        encode=lambda cloud: None, score=lambda features, cloud, candidates, mirror: logit.expand(len(candidates))
+        encode_batch=lambda clouds: [None],
+        score=lambda features, cloud, candidates, mirror: logit.expand(len(candidates)),
     )
     log_odds = math.log(shown / (1 - shown))
     recipe = replace(RECIPE, candidates_per_view=60)
