@@ -12,13 +12,13 @@ from functools import partial
 from python_multipart.multipart import parse_options_header
 
 from service.errors import Undecodable, UnknownContentType, shortened
+from service.payloads.grasp_query import build_query
 from service.payloads.json_body import decode_json
 from service.payloads.multipart_body import decode_multipart
 from service.payloads.npy_body import decode_npy
 from service.payloads.octets_body import decode_octet_stream
 from service.payloads.options import merged, parse_options, parse_query_string
 from service.payloads.payload import Payload, RawOptions
-from service.payloads.query import build_query
 
 __all__ = [
     "CONTENT_TYPES",

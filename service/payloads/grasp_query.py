@@ -1,4 +1,4 @@
-"""Points and checked options -> the predictor's query."""
+"""A payload and checked options -> the predictor's `GraspQuery`. Query strings are `options`' business."""
 
 from __future__ import annotations
 
