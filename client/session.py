@@ -39,6 +39,7 @@ from client.request import (
     points_request,
 )
 from client.retry import RetryPolicy
+from service.schemas import MAX_TIMEOUT_S
 
 if TYPE_CHECKING:
     from typing_extensions import Self, Unpack
@@ -48,9 +49,6 @@ if TYPE_CHECKING:
 T = TypeVar("T")
 
 DEFAULT_TIMEOUT = 30.0
-
-MAX_TIMEOUT = 3600.0
-"""The longest deadline that the service takes, seconds."""
 
 _DIRECT: Mapping[str, None] = dict.fromkeys(("all://127.0.0.1", "all://localhost", "all://[::1]"))
 """httpx's patterns of what no proxy that the environment names could reach for us: this machine itself."""
@@ -361,8 +359,8 @@ class _TimeLeft(dict[str, float]):
 
 
 def _checked_timeout(timeout: float) -> float:
-    if not 0 < timeout <= MAX_TIMEOUT:
-        raise InvalidArgument("timeout", f"is {timeout:g} s; give more than 0 and at most {MAX_TIMEOUT:g}")
+    if not 0 < timeout <= MAX_TIMEOUT_S:
+        raise InvalidArgument("timeout", f"is {timeout:g} s; give more than 0 and at most {MAX_TIMEOUT_S:g}")
     return timeout
 
 

@@ -17,7 +17,7 @@ from service import schemas
 from service.access import DOCS_FILES, OPEN_PATHS, AccessMiddleware
 from service.batching import PredictionWorker, PredictorFactory
 from service.errors import NotReady, ServiceError, Unauthorized, problem_response
-from service.grasps import MAX_TIMEOUT_S, GraspEndpoint
+from service.grasps import GraspEndpoint
 from service.inference_protocol import inference_protocol
 from service.metrics import Metrics
 from service.middleware import RequestMiddleware
@@ -166,7 +166,7 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
             max_approach_points=MAX_APPROACH_POINTS,
             max_candidates=MAX_CANDIDATES,
             queue_size=settings.queue_size,
-            max_timeout_s=MAX_TIMEOUT_S,
+            max_timeout_s=schemas.MAX_TIMEOUT_S,
         ),
         device=worker.device,
     )

@@ -1,4 +1,6 @@
-"""Exceptions -> `application/problem+json` (RFC 9457), in one table. Knows no routes.
+"""Exceptions -> `application/problem+json` (RFC 9457), in one table.
+
+Of the routes it knows where those of the Open Inference Protocol begin, whose clients look for a field of their own.
 
 ::
 

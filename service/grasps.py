@@ -1,5 +1,7 @@
-"""A request for grasps, from admission to answer. The event loop only waits: decoding, predicting and encoding happen
-in threads. Which bytes mean what is the business of a `ReaderFactory`: `GraspEndpoint.reader` for `POST /grasps`.
+"""A request for grasps, from admission to answer, within its deadline.
+
+Decoding, predicting and the encoding of long answers happen in threads, so that the event loop goes on. What the bytes
+of a body mean is the business of a `ReaderFactory`: `GraspEndpoint.reader` for `POST /grasps`.
 """
 
 from __future__ import annotations
@@ -32,7 +34,7 @@ from service.intake import Intake
 from service.metrics import Metrics
 from service.middleware import RequestRecord
 from service.payloads import OCTET_STREAM, build_query, decoder_for, merged, parse_options, parse_query_string
-from service.schemas import GraspOptions
+from service.schemas import MAX_TIMEOUT_S, GraspOptions
 from service.settings import Settings
 from tesnet.query import GraspQuery
 from tesnet.result import GraspResult
@@ -40,7 +42,6 @@ from tesnet.result import GraspResult
 if TYPE_CHECKING:
     from tesnet.predictor import ModelInfo
 
-MAX_TIMEOUT_S = 3600.0
 CODEC_THREADS = 2
 """Bodies decoded and answers encoded at once."""
 BODIES_IN_MEMORY = 4

@@ -11,7 +11,7 @@ from pydantic.json_schema import models_json_schema
 from service.answers import NPZ
 from service.errors import PROBLEM_JSON, PROBLEMS, ClientGone, UnknownModel
 from service.payloads import JSON, MULTIPART, NPY, OCTET_STREAM
-from service.schemas import DepthOptions, GraspOptions, GraspRequest, GraspResponse, Problem
+from service.schemas import MAX_TIMEOUT_S, DepthOptions, GraspOptions, GraspRequest, GraspResponse, Problem
 
 REF = "#/components/schemas/{model}"
 
@@ -104,7 +104,7 @@ def _grasps(options: dict[str, Any]) -> dict[str, Any]:
             _header(
                 "X-Request-Timeout",
                 "Seconds after which the answer is worthless to the client: a 504 then. Default 30.",
-                {"type": "number", "exclusiveMinimum": 0, "maximum": 3600},
+                {"type": "number", "exclusiveMinimum": 0, "maximum": MAX_TIMEOUT_S},
             ),
         ],
         "requestBody": {

@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING
 import uvicorn
 
 from service.logs import configure_logging
-from service.protocol import PunctualProtocol
+from service.protocol import KEEP_ALIVE_SECONDS, PunctualProtocol
 from service.settings import InvalidSetting, Settings, load_settings, service_version, unknown_variables, variables
 
 if TYPE_CHECKING:
@@ -29,8 +29,6 @@ if TYPE_CHECKING:
 
 log = logging.getLogger("service")
 
-KEEP_ALIVE_SECONDS = 65
-"""Longer than the minute after which common proxies drop idle connections, so that the proxy closes first."""
 LAST_BYTES_SECONDS = 2
 """For answers on their way when draining has ended."""
 MAX_OPEN_FILES = 65_536

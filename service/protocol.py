@@ -8,6 +8,9 @@ from typing import Any
 import h11
 from uvicorn.protocols.http.h11_impl import H11Protocol
 
+KEEP_ALIVE_SECONDS = 65
+"""Longer than the minute after which common proxies drop idle connections, so that the proxy closes first."""
+
 HEAD_SECONDS = 10.0
 """For a request's head, from the connection or from the head's first byte. A body has the request's deadline."""
 

@@ -19,6 +19,9 @@ from tesnet.result import Reason
 REQUEST_ID = r"[A-Za-z0-9._:/+=-]{1,128}"
 """What a client may call its request in X-Request-ID; a request that comes with anything else is given a name."""
 
+MAX_TIMEOUT_S = 3600.0
+"""The longest deadline that a request may give in X-Request-Timeout, seconds."""
+
 Vector = tuple[float, float, float]
 Quaternion = tuple[float, float, float, float]
 MatrixRow = tuple[float, float, float, float]

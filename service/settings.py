@@ -1,4 +1,7 @@
-"""Environment variables -> Settings. The environment is an argument: only `__main__` reads it."""
+"""Environment variables -> Settings. The environment is an argument: what starts a process reads its own.
+
+Of the machine it asks how many cores the process may use, which is how many threads it has unless told otherwise.
+"""
 
 from __future__ import annotations
 
@@ -11,7 +14,9 @@ from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
 from typing import Literal
 
-from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator, model_validator
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
+
+from service.schemas import MAX_TIMEOUT_S
 
 PREFIX = "GRASP_"
 MAX_THREADS = 8
@@ -89,7 +94,10 @@ class Settings(BaseModel):
         description="Waiting requests predicted together, 1 to 64; more than 1 does not pay on a CPU.",
     )
     request_timeout: float = Field(
-        default=30.0, gt=0, le=3600, description="Seconds to answer a request without X-Request-Timeout, at most 3600."
+        default=30.0,
+        gt=0,
+        le=MAX_TIMEOUT_S,
+        description=f"Seconds to answer a request without X-Request-Timeout, at most {MAX_TIMEOUT_S:g}.",
     )
     drain_timeout: float = Field(
         default=25.0,
@@ -139,42 +147,6 @@ class Settings(BaseModel):
     def max_body_bytes(self) -> int:
         """Bytes in a request's body."""
         return int(self.max_body_mb * 2**20)
-
-
-class Replicas(BaseModel):
-    """How many of the service Ray Serve runs, and each one's share of a machine."""
-
-    model_config = ConfigDict(extra="forbid", frozen=True)
-
-    min_replicas: int = Field(default=1, ge=1, le=1000, description="Replicas that are always there, 1 to 1000.")
-    max_replicas: int = Field(
-        default=1, ge=1, le=1000, description="Replicas under load, from --min-replicas (the default) to 1000."
-    )
-    target_ongoing_requests: float = Field(
-        default=2.0, gt=0, le=1000, description="Requests a replica should have; more of them add replicas."
-    )
-    downscale_delay: float = Field(
-        default=120.0, ge=0, le=86400, description="Seconds of less load before replicas are taken away, 0 to 86400."
-    )
-    cpus: float = Field(default=1.0, gt=0, le=1024, description="CPU cores of a replica, more than 0.")
-    gpus: float = Field(
-        default=0.0, ge=0, le=64, description="GPUs of a replica: 0, a share such as 0.25, or a whole number."
-    )
-
-    @field_validator("gpus")
-    @classmethod
-    def _share_or_whole(cls, gpus: float) -> float:
-        if gpus > 1 and gpus != int(gpus):
-            raise ValueError("a share of a GPU is less than 1")
-        return gpus
-
-    @model_validator(mode="after")
-    def _fits(self) -> Replicas:
-        if self.max_replicas < self.min_replicas:
-            raise ValueError(
-                f"is {self.max_replicas}, less than --min-replicas, {self.min_replicas}; give at least that"
-            )
-        return self
 
 
 def load_settings(environment: Mapping[str, str]) -> Settings:

@@ -9,8 +9,9 @@ from pathlib import Path
 from pydantic import BaseModel
 from pydantic.fields import FieldInfo
 
+from service.deploy.replicas import Replicas
 from service.metrics import Metrics
-from service.settings import Replicas, Settings
+from service.settings import Settings
 
 ROOT = Path(__file__).resolve().parents[1]
 PAGE = (ROOT / "docs" / "deploy.md").read_text(encoding="utf-8")

@@ -18,7 +18,7 @@ from service.access import OPEN_PATHS
 from service.answers import NPZ
 from service.app import create_app
 from service.errors import INTERNAL, PROBLEMS, ClientGone
-from service.inference_protocol import OUTPUTS
+from service.inference_protocol.tensors import OUTPUTS
 from service.settings import Settings
 from service.viewer import PAGE_PATHS
 from tesnet.result import Reason

@@ -19,7 +19,7 @@ import signal
 import sys
 import threading
 import time
-from collections.abc import AsyncIterator, Mapping
+from collections.abc import AsyncIterator
 from concurrent.futures import Future, ThreadPoolExecutor
 from contextlib import ExitStack, asynccontextmanager, suppress
 from types import FrameType
@@ -27,15 +27,16 @@ from typing import TYPE_CHECKING, Any
 
 import anyio.to_thread
 import httpx
-from pydantic import ValidationError
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.middleware import Middleware
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
+from service.deploy.replicas import Replicas, option_name, replica_settings, replicas_from
 from service.errors import PROBLEM_JSON, NotReady, problem_response
 from service.logs import configure_logging
 from service.middleware import RequestRecord, request_id_of
-from service.settings import InvalidSetting, Replicas, Settings, load_settings, service_version
+from service.protocol import KEEP_ALIVE_SECONDS
+from service.settings import InvalidSetting, Settings, load_settings, service_version
 
 if TYPE_CHECKING:
     from fastapi import FastAPI
@@ -56,9 +57,6 @@ LOGS = "/tmp/ray/session_latest/logs/serve"  # noqa: S108 - where Ray writes the
 
 TRIES_TO_START = 3
 """Starts of a replica that fail, for instance over missing weights, before the application counts as failed."""
-
-KEEP_ALIVE_SECONDS = 65
-"""As `python -m service` has it."""
 
 SPARE_REQUESTS = 16
 """Requests that a replica is given beyond those that wait or are computed: those it decodes, refuses, or answers."""
@@ -96,21 +94,6 @@ def application(replicas: Replicas) -> Application:
         **number,
     )
     return deploy(serve.ingress(build)()).bind()
-
-
-def replica_settings(environment: Mapping[str, str], replicas: Replicas) -> Settings:
-    """The settings, where unset fitted to a replica's share of its machine: its cores, and a GPU only if it has one.
-
-    Raises:
-        InvalidSetting: a `GRASP_*` variable cannot be used.
-    """
-    settings = load_settings(environment)
-    fitted: dict[str, Any] = {}
-    if "num_threads" not in settings.model_fields_set:
-        fitted["num_threads"] = max(1, int(replicas.cpus))
-    if settings.device == "auto" and not replicas.gpus:
-        fitted["device"] = "cpu"
-    return settings.model_copy(update=fitted)
 
 
 def replica_app(settings: Settings) -> FastAPI:
@@ -220,26 +203,6 @@ def main() -> int:
             return ray_thread.submit(_run, settings, replicas, ending, own_cluster=address == LOCAL).result()
     except InvalidSetting as error:
         return _fail(str(error), 2)
-
-
-def replicas_from(options: Mapping[str, Any]) -> Replicas:
-    """The replicas that the command line asks for.
-
-    Raises:
-        InvalidSetting: an option is out of range.
-    """
-    given = {name: value for name, value in options.items() if value is not None}
-    if "max_replicas" not in given and "min_replicas" in given:
-        given["max_replicas"] = given["min_replicas"]
-    try:
-        return Replicas.model_validate(given)
-    except ValidationError as error:
-        first = error.errors(include_url=False)[0]
-        if not first["loc"]:
-            raise InvalidSetting("--max-replicas", first["msg"].removeprefix("Value error, ")) from None
-        field = str(first["loc"][0])
-        remedy = Replicas.model_fields[field].description
-        raise InvalidSetting(_option(field), f"is {first['input']}; expected: {remedy}") from None
 
 
 def check_room(replicas: Replicas) -> None:
@@ -404,10 +367,6 @@ def _fail(message: str, code: int) -> int:
     return code
 
 
-def _option(field: str) -> str:
-    return f"--{field.replace('_', '-')}"
-
-
 def _parser() -> argparse.ArgumentParser:
     parser = argparse.ArgumentParser(
         prog="python -m service.deploy.ray",
@@ -418,7 +377,7 @@ def _parser() -> argparse.ArgumentParser:
     for name, field in Replicas.model_fields.items():
         default = "" if name == "max_replicas" else f" Default: {field.default}."
         kind = int if field.annotation is int else float
-        parser.add_argument(_option(name), type=kind, metavar="N", help=f"{field.description}{default}")
+        parser.add_argument(option_name(name), type=kind, metavar="N", help=f"{field.description}{default}")
     parser.add_argument(
         "--address", default=LOCAL, help=f"a running Ray cluster, or `{LOCAL}` for one of this machine (default)"
     )

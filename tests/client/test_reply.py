@@ -126,13 +126,6 @@ def test_every_status_has_its_class(status: int, refusing: Callable[..., Answeri
         assert str(same) == f"{status} A title: A detail. (request r-1)"
 
 
-@pytest.mark.parametrize("error", [client.InvalidArgument("points", "bad"), client.UnexpectedResponse("odd", 200)])
-def test_errors_survive_the_way_back_from_a_worker_process(error: Exception) -> None:
-    same = pickle.loads(pickle.dumps(error))
-    assert type(same) is type(error)
-    assert (str(same), vars(same)) == (str(error), vars(error))
-
-
 @pytest.mark.parametrize("status", [401, 413, 429, 503, 504])
 def test_a_proxy_that_refuses_in_its_own_words_is_the_same_kind_of_problem(status: int) -> None:
     error = problem(Answer(status, {"retry-after": "3"}, b"<html>no</html>"))

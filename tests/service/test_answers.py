@@ -15,7 +15,8 @@ from service.answers import encoder_for
 from service.errors import NotAcceptable
 from service.schemas import GraspResponse
 from tesnet.geometry import quaternions_xyzw
-from tests.service.test_contract import OPTIONS, steady, url_options
+from tests.service.test_contract import OPTIONS, steady
+from tests.service.wire import url_options
 
 NPZ, JSON = "application/x-npz", "application/json"
 

@@ -2,13 +2,10 @@
 
 from __future__ import annotations
 
-import io
 import json
 import os
 import pickle
-import socket
 import urllib.parse
-from collections.abc import Iterator
 from typing import Any
 
 import httpx
@@ -16,34 +13,12 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.schemas import Problem
+from tests.service.wire import OCTETS, npy, post_head, problem_of
 
 JSON = {"Content-Type": "application/json"}
-OCTETS = {"Content-Type": "application/octet-stream"}
 NPY = {"Content-Type": "application/x-npy"}
 
 TRIANGLE = [[0.0, 0.0, 0.5], [0.01, 0.0, 0.5], [0.0, 0.01, 0.5]]
-
-
-def problem_of(answer: httpx.Response, status: int, *words: str) -> Problem:
-    """The problem document, after checking what holds for every one of them."""
-    assert answer.status_code == status, answer.text
-    assert answer.headers["Content-Type"] == "application/problem+json"
-    problem = Problem.model_validate(answer.json(), extra="forbid", strict=True)
-    assert problem.status == status
-    assert problem.type.startswith("urn:tes-net:problem:")
-    assert problem.request_id == answer.headers["X-Request-ID"]
-    assert "Traceback" not in answer.text
-    assert len(answer.text) < 2000
-    for word in words:
-        assert word in problem.detail, problem.detail
-    return problem
-
-
-def npy(array: NDArray[Any], **options: Any) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array, **options)
-    return file.getvalue()
 
 
 def npy_header(text: str, version: bytes = b"\x01\x00") -> bytes:
@@ -286,7 +261,7 @@ def test_an_option_in_both_places_is_a_422(http: httpx.Client) -> None:
 
 
 def test_a_wrong_option_is_refused_before_the_body_is_read(service_url: str) -> None:
-    with raw_post(service_url, "/grasps?sed=1", "Content-Length: 60000000") as connection:
+    with post_head(service_url, "/grasps?sed=1", headers="Content-Length: 60000000") as connection:
         assert connection.recv(4096).startswith(b"HTTP/1.1 422 ")
 
 
@@ -334,47 +309,6 @@ def test_a_npy_that_only_claims_to_be_huge_is_a_413(http: httpx.Client) -> None:
     problem_of(http.post("/grasps", content=body, headers=NPY), 413, "1000000")
 
 
-def test_an_announced_body_above_the_limit_is_a_413_before_it_is_sent(service_url: str) -> None:
-    with raw_post(service_url, "/grasps", "Content-Length: 67108865") as connection:
-        assert connection.recv(4096).startswith(b"HTTP/1.1 413 ")
-
-
-def test_a_client_that_asks_before_sending_is_told_at_once(service_url: str) -> None:
-    with raw_post(service_url, "/grasps", "Content-Length: 67108865\r\nExpect: 100-continue") as connection:
-        assert connection.recv(4096).startswith(b"HTTP/1.1 413 ")
-        while connection.recv(4096):  # and the connection ends, without a body
-            pass
-
-
-def test_a_chunked_body_above_the_limit_is_a_413_before_it_ends(service_url: str) -> None:
-    chunk = b"100000\r\n" + bytes(2**20) + b"\r\n"
-    with raw_post(service_url, "/grasps", "Transfer-Encoding: chunked") as connection:
-        for _ in range(66):
-            connection.sendall(chunk)
-        assert connection.recv(4096).startswith(b"HTTP/1.1 413 ")  # though the last chunk was never sent
-
-
-def test_a_client_that_sends_a_too_large_body_to_its_end_reads_the_413(http: httpx.Client) -> None:
-    def body() -> Iterator[bytes]:
-        for _ in range(80):
-            yield bytes(2**20)
-
-    problem_of(http.post("/grasps", content=body(), headers=OCTETS), 413, "67108864")
-
-
-@pytest.mark.parametrize("path", ["/", "/grasp", "/grasps/", "/health", "/v2/repository/index"])
-def test_another_path_is_a_404(http: httpx.Client, path: str) -> None:
-    problem_of(http.get(path), 404, "/docs")
-
-
-def test_another_method_is_a_405_that_names_the_right_one(http: httpx.Client) -> None:
-    answer = http.get("/grasps")
-    problem_of(answer, 405, "POST")
-    assert answer.headers["Allow"] == "POST"
-    problem_of(http.post("/health/live"), 405, "GET")
-    problem_of(http.request("BREW", "/grasps"), 405)
-
-
 def test_no_problem_says_anything_of_the_cloud(http: httpx.Client) -> None:
     body = b'{"points": [[0.123456, 0.2, 0.3], [0.123456, 0.2, "0.123456"]]}'
     assert "0.123456" not in http.post("/grasps", content=body, headers=JSON).text
@@ -385,13 +319,3 @@ def test_no_problem_says_anything_of_the_cloud(http: httpx.Client) -> None:
 def test_the_service_is_well_after_all_this(http: httpx.Client) -> None:
     assert http.get("/health/ready").status_code == 200
     assert 'status="500"' not in http.get("/metrics").text
-
-
-def raw_post(url: str, path: str, headers: str) -> socket.socket:
-    """A connection on which the head of a POST was sent, and nothing of its body."""
-    parts = urllib.parse.urlsplit(url)
-    connection = socket.create_connection((parts.hostname or "", parts.port or 0), timeout=30)
-    connection.sendall(
-        f"POST {path} HTTP/1.1\r\nHost: test\r\nContent-Type: application/octet-stream\r\n{headers}\r\n\r\n".encode()
-    )
-    return connection

@@ -2,9 +2,7 @@
 
 from __future__ import annotations
 
-import io
 import json
-import re
 import urllib.parse
 from typing import Any
 
@@ -13,9 +11,10 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.schemas import DepthOptions, GraspOptions, GraspRequest, GraspResponse, ModelResponse
+from service.schemas import GraspOptions, GraspResponse
 from tesnet.geometry import HAND_TO_TCP, Pose
 from tesnet.result import REJECTIONS
+from tests.service.wire import npy, post_octets, url_options
 
 VOLATILE = ("timings_ms", "request_id")
 
@@ -39,28 +38,6 @@ OPTIONS: dict[str, Any] = {
     "model": "tesnet",
 }
 """Every option."""
-
-
-def npy(array: NDArray[Any], **options: Any) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array, **options)
-    return file.getvalue()
-
-
-def url_options(options: dict[str, Any]) -> str:
-    plain = {key: value if isinstance(value, str) else json.dumps(value) for key, value in options.items()}
-    return urllib.parse.urlencode(plain)
-
-
-def post_octets(http: httpx.Client, cloud: NDArray[np.float32], **options: Any) -> dict[str, Any]:
-    answer = http.post(
-        f"/grasps?{url_options(options)}",
-        content=cloud.astype("<f4").tobytes(),
-        headers={"Content-Type": "application/octet-stream"},
-    )
-    assert answer.status_code == 200, answer.text
-    document: dict[str, Any] = answer.json()
-    return document
 
 
 def steady(answer: dict[str, Any]) -> dict[str, Any]:
@@ -191,100 +168,3 @@ def test_an_empty_workspace_says_so(http: httpx.Client, cloud: NDArray[np.float3
 def test_a_million_points_pass(http: httpx.Client, cloud: NDArray[np.float32]) -> None:
     million = np.tile(cloud, (167, 1))[:1_000_000]
     assert post_octets(http, million, max_candidates=100)["counts"]["points"] == 1_000_000
-
-
-def test_the_request_id_comes_back_or_is_made_up(http: httpx.Client) -> None:
-    given = http.get("/health/live", headers={"X-Request-ID": "robot-7/cell:3"})
-    assert given.headers["X-Request-ID"] == "robot-7/cell:3"
-    for unfit in ("with space", "a" * 129, 'quote"'):
-        made_up = http.get("/health/live", headers={"X-Request-ID": unfit}).headers["X-Request-ID"]
-        assert made_up.isalnum()
-        assert made_up != http.get("/health/live").headers["X-Request-ID"]
-
-
-def test_one_log_line_a_request_tells_what_happened(
-    http: httpx.Client, shared_service: Any, cloud: NDArray[np.float32]
-) -> None:
-    http.post(
-        "/grasps?max_candidates=100",
-        content=cloud.tobytes(),
-        headers={"Content-Type": "application/octet-stream", "X-Request-ID": "logged-1"},
-    )
-    line = shared_service.wait_for("request", request_id="logged-1")
-    assert (line["method"], line["path"], line["status"]) == ("POST", "/grasps", 200)
-    assert (line["points"], line["bytes_in"]) == (len(cloud), 12 * len(cloud))
-    assert line["timings_ms"]["total"] <= line["duration_ms"]
-    assert sum(other.get("request_id") == "logged-1" for other in shared_service.lines) == 1
-
-
-def test_model_tells_networks_frames_gripper_and_limits(http: httpx.Client, cloud: NDArray[np.float32]) -> None:
-    answer = http.get("/model")
-    model = ModelResponse.model_validate(answer.json(), extra="forbid")
-    identity = post_octets(http, cloud, max_candidates=50)["model"]
-    assert (model.models[0].name, model.models[0].weights_sha256) == (identity["name"], identity["weights_sha256"])
-    assert model.limits.max_points == 1_000_000
-    assert model.limits.max_body_bytes == 64 * 2**20
-    assert model.gripper.max_width == 0.08
-    assert model.models[0].card
-    assert model.device == "cpu"
-
-
-def test_health_and_metrics(http: httpx.Client, cloud: NDArray[np.float32]) -> None:
-    assert http.get("/health/live").json() == {"status": "live"}
-    assert http.get("/health/ready").json() == {"status": "ready"}
-    post_octets(http, cloud, max_candidates=50)
-    text = http.get("/metrics").text
-    for line in (
-        'grasp_requests_total{method="POST",route="/grasps",status="200"}',
-        'grasp_stage_seconds_count{stage="network"}',
-        "grasp_queue_depth 0.0",
-        "grasp_batch_size_count",
-        "grasp_ready 1.0",
-    ):
-        assert line in text
-
-
-@pytest.mark.parametrize("path", ["/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"])
-def test_probes_may_ask_for_the_head_alone(http: httpx.Client, path: str) -> None:
-    answer = http.head(path)
-    assert (answer.status_code, answer.content) == (200, b"")
-
-
-def test_the_documentation_covers_bodies_options_and_problems(http: httpx.Client) -> None:
-    page = http.get("/docs").text
-    loaded = re.findall(r'(?:src|href)="([^"]+)"', page)
-    assert any("swagger" in address for address in loaded)
-    for address in loaded:  # from this service, so that the page works where there is no other network
-        assert http.get(address).status_code == 200, address
-    document = http.get("/openapi.json").json()
-    post = document["paths"]["/grasps"]["post"]
-    assert set(post["requestBody"]["content"]) == {
-        "application/json",
-        "application/octet-stream",
-        "application/x-npy",
-        "multipart/form-data",
-    }
-    assert set(post["responses"]["200"]["content"]) == {"application/json", "application/x-npz"}
-    form = post["requestBody"]["content"]["multipart/form-data"]["schema"]["properties"]
-    assert set(form) == {"cloud", "depth", "mask", "options"}
-    assert set(document["components"]["schemas"]["DepthOptions"]["properties"]) == set(DepthOptions.model_fields)
-    assert set(post["responses"]) == {"200", "400", "401", "406", "413", "415", "422", "429", "503", "504"}
-    assert all(
-        "application/problem+json" in response["content"]
-        for status, response in post["responses"].items()
-        if status != "200"
-    )
-    query = {parameter["name"] for parameter in post["parameters"] if parameter["in"] == "query"}
-    assert query == set(GraspOptions.model_fields)
-    assert set(document["components"]["schemas"]["GraspRequest"]["properties"]) == set(GraspRequest.model_fields)
-    references = set(_references(document))
-    assert references
-    for reference in references:
-        assert reference.rpartition("/")[2] in document["components"]["schemas"]
-
-
-def _references(node: Any) -> list[str]:
-    if isinstance(node, dict):
-        here = [node["$ref"]] if isinstance(node.get("$ref"), str) else []
-        return here + [ref for value in node.values() for ref in _references(value)]
-    return [ref for value in node for ref in _references(value)] if isinstance(node, list) else []

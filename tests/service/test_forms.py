@@ -19,8 +19,8 @@ from pypcd4.pypcd4 import Encoding, PointCloud
 
 from service.payloads import Payload, decoder_for
 from tests.depth_scene import SIZE, box_on_table
-from tests.service.test_bad_input import problem_of
-from tests.service.test_contract import npy, post_octets, steady
+from tests.service.test_contract import steady
+from tests.service.wire import npy, post_octets, problem_of
 from tests.tesnet.test_formats import ply
 
 Cloud = NDArray[np.float32]

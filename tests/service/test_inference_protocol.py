@@ -13,7 +13,7 @@ import tritonclient.http as triton
 from numpy.typing import NDArray
 from tritonclient.utils import InferenceServerException
 
-from service.inference_protocol import HEADER_LENGTH, OUTPUTS
+from service.inference_protocol.tensors import HEADER_LENGTH, OUTPUTS
 
 Cloud = NDArray[np.float32]
 

@@ -9,7 +9,6 @@ import signal
 import socket
 import subprocess
 import sys
-import urllib.parse
 from collections.abc import Callable, Iterator
 from contextlib import ExitStack, contextmanager, suppress
 from pathlib import Path
@@ -23,12 +22,12 @@ from numpy.typing import NDArray
 from client import GraspClient
 from client.retry import RetryPolicy
 from simharness.play.server import free_port
+from tests.service.wire import POINTS, connect
 
 Cloud = NDArray[np.float32]
 Eventually = Callable[[Callable[[], bool]], None]
 
 START_TIMEOUT_S = 300.0
-POINTS = np.zeros((20, 3), np.float32).tobytes()
 HEAD = (
     b"POST /grasps HTTP/1.1\r\nHost: test\r\nContent-Type: application/octet-stream\r\n"
     b"Content-Length: 240\r\nExpect: 100-continue\r\n\r\n"
@@ -42,11 +41,6 @@ time.time_ns = lambda: int(1e9 * time.time())
 sys.argv = ["service"]
 runpy.run_module("service", run_name="__main__")
 """
-
-
-def connect(url: str) -> socket.socket:
-    parts = urllib.parse.urlsplit(url)
-    return socket.create_connection((parts.hostname or "", parts.port or 0), timeout=60)
 
 
 def begin(url: str) -> socket.socket:

@@ -5,21 +5,13 @@ from __future__ import annotations
 import concurrent.futures
 import gc
 import logging
-import select
-import socket
-import time
-import urllib.parse
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 
-from service.protocol import PunctualProtocol
-
-POINTS = np.zeros((20, 3), np.float32).tobytes()
-OCTETS = {"Content-Type": "application/octet-stream"}
+from tests.service.wire import POINTS, post, post_head
 
 Serve = Callable[..., Any]
 Eventually = Callable[[Callable[[], bool]], None]
@@ -29,11 +21,6 @@ Eventually = Callable[[Callable[[], bool]], None]
 def pool() -> Iterator[concurrent.futures.ThreadPoolExecutor]:
     with concurrent.futures.ThreadPoolExecutor(8) as executor:
         yield executor
-
-
-def post(url: str, seed: int = 0, **headers: str) -> httpx.Response:
-    renamed = {name.replace("_", "-"): value for name, value in headers.items()}
-    return httpx.post(f"{url}/grasps?seed={seed}", content=POINTS, headers={**OCTETS, **renamed}, timeout=60)
 
 
 def test_health_answers_while_a_grasp_is_computed(serve: Serve, pool: concurrent.futures.ThreadPoolExecutor) -> None:
@@ -115,24 +102,6 @@ def test_requests_that_wait_are_predicted_together(
     assert 'grasp_batch_size_bucket{le="2.0"} 1.0' in httpx.get(f"{server.url}/metrics").text
 
 
-def test_a_connection_whose_head_never_comes_is_closed(serve: Serve) -> None:
-    class Impatient(PunctualProtocol):
-        head_seconds = 0.2
-
-    server = serve(protocol=Impatient)
-    server.predictor.gate.set()
-    parts = urllib.parse.urlsplit(server.url)
-    address = (parts.hostname or "", parts.port or 0)
-    with socket.create_connection(address, timeout=30) as silent, socket.create_connection(address, 30) as slow:
-        slow.sendall(b"POST /grasps HT")
-        assert silent.recv(1) == slow.recv(1) == b""
-    with post_head(server.url) as decent:
-        time.sleep(0.4)  # a body has the request's deadline, not the head's
-        decent.sendall(POINTS)
-        assert decent.recv(4096).startswith(b"HTTP/1.1 200 ")
-    assert post(server.url).status_code == 200
-
-
 def test_the_default_deadline_is_a_setting(serve: Serve) -> None:
     assert post(serve(request_timeout=0.2).url).status_code == 504
 
@@ -198,28 +167,3 @@ def test_a_fault_of_the_predictor_is_a_500_that_tells_no_details_and_the_next_re
     assert "secret" not in answer.text
     server.predictor.fault = None
     assert post(server.url).status_code == 200
-
-
-def test_too_many_bytes_at_once_are_a_429_and_are_forgotten(serve: Serve, eventually: Eventually) -> None:
-    server = serve(max_body_mb=1.0)
-    server.predictor.gate.set()
-    uploads = [post_head(server.url, length=2**20) for _ in range(5)]
-    for upload in uploads:
-        upload.sendall(bytes(2**20 - 1))
-    refused = select.select(uploads, [], [], 30)[0][0]  # whichever's bytes came last
-    assert refused.recv(4096).startswith(b"HTTP/1.1 429 ")
-    for upload in uploads:
-        upload.close()
-    eventually(lambda: server.endpoint.active == 0)
-    assert post(server.url).status_code == 200
-
-
-def post_head(url: str, path: str = "/grasps", length: int = len(POINTS)) -> socket.socket:
-    """A connection on which the head of a POST was sent."""
-    parts = urllib.parse.urlsplit(url)
-    connection = socket.create_connection((parts.hostname or "", parts.port or 0), timeout=30)
-    connection.sendall(
-        f"POST {path} HTTP/1.1\r\nHost: test\r\nContent-Type: application/octet-stream\r\n"
-        f"Content-Length: {length}\r\n\r\n".encode()
-    )
-    return connection

@@ -14,7 +14,7 @@ import yaml
 
 from service.settings import Settings, load_settings
 
-DEPLOY = Path(__file__).resolve().parents[2] / "service" / "deploy"
+DEPLOY = Path(__file__).resolve().parents[3] / "service" / "deploy"
 KUBERNETES = DEPLOY / "kubernetes"
 KSERVE = DEPLOY / "kserve" / "inference-service.yaml"
 MANIFESTS = sorted(path.name for path in KUBERNETES.glob("*.yaml") if path.name != "kustomization.yaml")

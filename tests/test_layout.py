@@ -1,0 +1,29 @@
+"""That a stranger finds the test of a line: the rule of CONTRIBUTING.md, "Where the test of a line is"."""
+
+from __future__ import annotations
+
+from pathlib import Path
+
+import pytest
+
+ROOT = Path(__file__).resolve().parents[1]
+
+COMMANDS = {
+    "service/__main__.py": "tests/service/test_process.py",
+    "client/__main__.py": "tests/client/test_command.py",
+}
+"""What `python -m` starts is tested as its user meets it."""
+
+
+@pytest.mark.parametrize("package", ["client", "service"])
+def test_every_module_has_a_test_file_of_its_name_or_of_its_package(package: str) -> None:
+    modules = [path.relative_to(ROOT) for path in sorted((ROOT / package).rglob("*.py")) if path.name != "__init__.py"]
+    assert modules
+    without = []
+    for module in modules:
+        own = ROOT / "tests" / module.parent / f"test_{module.name}"
+        of_its_package = ROOT / "tests" / module.parent.parent / f"test_{module.parent.name}.py"
+        command = ROOT / COMMANDS.get(module.as_posix(), "none")
+        if not (own.exists() or of_its_package.exists() or command.exists()):
+            without.append(module.as_posix())
+    assert without == []
