@@ -4,6 +4,7 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
+from dataclasses import asdict
 
 import anyio.to_thread
 import msgspec
@@ -26,7 +27,7 @@ from service.payloads import CONTENT_TYPES
 from service.settings import Settings, service_version
 from service.viewer import viewer
 from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
-from tesnet.geometry import FRAME_CONVENTIONS, HAND_TO_TCP, PANDA
+from tesnet.geometry import FRAME_CONVENTIONS, HAND_TO_TCP, PANDA, Gripper
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
 
 DESCRIPTION = """Point cloud in, ranked SE(3) grasps out. Lengths are metres; poses are in the frame of the request's
@@ -150,13 +151,7 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
                 configuration=msgspec.to_builtins(info.configuration),
             )
         ],
-        gripper=schemas.GripperOut(
-            max_width=PANDA.max_width,
-            finger_depth=PANDA.finger_depth,
-            finger_thickness=PANDA.finger_thickness,
-            finger_breadth=PANDA.finger_breadth,
-            hand_to_tcp=HAND_TO_TCP,
-        ),
+        gripper=_gripper(PANDA),
         frame_conventions=list(FRAME_CONVENTIONS),
         content_types=list(CONTENT_TYPES),
         limits=schemas.LimitsOut(
@@ -169,6 +164,24 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
             max_timeout_s=schemas.MAX_TIMEOUT_S,
         ),
         device=worker.device,
+    )
+
+
+def _gripper(hand: Gripper) -> schemas.GripperOut:
+    return schemas.GripperOut(
+        max_width=hand.max_width,
+        finger_depth=hand.finger_depth,
+        finger_thickness=hand.finger_thickness,
+        finger_breadth=hand.finger_breadth,
+        hand_to_tcp=HAND_TO_TCP,
+        parts=[
+            schemas.PartOut(
+                name=part.name,
+                side=part.side,
+                sections=[schemas.SectionOut(**asdict(section)) for section in part.sections],
+            )
+            for part in hand.parts
+        ],
     )
 
 

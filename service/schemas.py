@@ -12,7 +12,7 @@ from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tesnet.geometry import PANDA, FrameConvention
+from tesnet.geometry import PANDA, FrameConvention, PartName
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS
 from tesnet.result import Reason
 
@@ -335,6 +335,25 @@ class Health(ResponsePart):
     status: Literal["live", "ready"] = Field(description="`live`: the process works; `ready`: it takes requests.")
 
 
+class SectionOut(ResponsePart):
+    """A rectangle across the direction of travel, metres."""
+
+    z: float = Field(description="Where it is along z of the grasp frame, whose origin is the TCP.")
+    breadth: float = Field(description="Its extent along x, about x = 0.")
+    thickness: float = Field(description="Its extent along y: about y = 0, or outwards from a finger's inner face.")
+
+
+class PartOut(ResponsePart):
+    """One solid of the hand: the convex hull of its sections."""
+
+    name: PartName = Field(description="What it is called.")
+    side: Literal[-1, 0, 1] = Field(
+        description="0: it lies about the hand's middle; 1, -1: a finger, whose inner face lies at `side * width / 2` "
+        "along y."
+    )
+    sections: list[SectionOut] = Field(description="From its front to its back.")
+
+
 class GripperOut(ResponsePart):
     """The hand that collision checks and candidates assume, metres."""
 
@@ -343,6 +362,9 @@ class GripperOut(ResponsePart):
     finger_thickness: float = Field(description="Extent of one finger along the closing direction.")
     finger_breadth: float = Field(description="Extent of one finger across the hand's plane.")
     hand_to_tcp: float = Field(description="From `panda_hand` to the TCP, along z.")
+    parts: list[PartOut] = Field(
+        default_factory=list, description="The solids that the collision check takes the hand for."
+    )
 
 
 class LimitsOut(ResponsePart):

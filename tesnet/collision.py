@@ -9,7 +9,7 @@ import torch
 from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
-from tesnet.geometry import Gripper
+from tesnet.geometry import Extent, Gripper, Part
 from tesnet.visibility import depth_behind
 
 SHADOW_MARGIN = 0.01
@@ -49,29 +49,31 @@ def in_collision(
 def _hit(points: Tensor, poses: Tensor, gripper: Gripper, width: float, approach_distance: float) -> Tensor:
     x, y, z = points_in_grasp_frames(points, poses)
     x, y = x.abs_(), y.abs_()
-    # Swept along z, a tapered body is as wide at each place as where it comes to rest.
-    finger_slope = (gripper.finger_thickness - gripper.finger_tip_thickness) / gripper.finger_taper
-    thickness = ((gripper.tip_offset - z) * finger_slope + gripper.finger_tip_thickness).clamp_(
-        max=gripper.finger_thickness
-    )
-    fingers = (
-        (y > width / 2)
-        & (y < thickness + width / 2)
-        & (x < gripper.finger_breadth / 2)
-        & (z < gripper.tip_offset)
-        & (z > gripper.palm_front - approach_distance)
-    )
-    palm_slope = (gripper.palm_breadth - gripper.palm_front_breadth) / 2 / gripper.palm_taper
-    half_breadth = ((gripper.palm_front - z) * palm_slope + gripper.palm_front_breadth / 2).clamp_(
-        max=gripper.palm_breadth / 2
-    )
-    palm = (
-        (z < gripper.palm_front)
-        & (x < half_breadth)
-        & (y < gripper.palm_length / 2)
-        & (z > gripper.palm_front - gripper.palm_depth - approach_distance)
-    )
-    return (fingers | palm).any(dim=1)
+    hit = torch.zeros(len(poses), dtype=torch.bool, device=points.device)
+    for part in gripper.parts:
+        if part.side >= 0:  # seen by |y|, one finger is both
+            hit |= _swept(part, x, y, z, width, approach_distance).any(dim=1)
+    return hit
+
+
+def _swept(part: Part, x: Tensor, y: Tensor, z: Tensor, width: float, distance: float) -> Tensor:
+    """Mask (C, P) of the places (|x|, |y|, z), each (C, P), that a part passes on the last `distance` of its way.
+
+    Swept along z, a tapered part is as wide at each place as where it comes to rest. The rounding of a finger's tip is
+    left out: prepared points lie nearly as far apart as it is long.
+    """
+    inside = (z < part.front) & (z > part.back - distance) & (x < _extent(part.breadth, part.front, z, 0.5))
+    if part.side:
+        return inside & (y > width / 2) & (y < _extent(part.thickness, part.front, z, 1.0) + width / 2)
+    return inside & (y < _extent(part.thickness, part.front, z, 0.5))
+
+
+def _extent(extent: Extent, front: float, z: Tensor, share: float) -> Tensor | float:
+    """A share of a part's extent at each z (C, P)."""
+    if not extent.taper:
+        return share * extent.full
+    slope = share * (extent.full - extent.front) / extent.taper
+    return ((front - z) * slope + share * extent.front).clamp_(max=share * extent.full)
 
 
 def points_in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
@@ -96,19 +98,22 @@ def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper
 
     The fingers and the palm's front are sampled.
     """
-    samples = torch.tensor(_hand_samples(gripper, width), dtype=torch.float32, device=cloud.points.device)
+    samples = torch.tensor(
+        [place for part in gripper.parts for place in _samples(part, width)],
+        dtype=torch.float32,
+        device=cloud.points.device,
+    )
     places = samples @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
     return (depth_behind(cloud, places) > SHADOW_MARGIN).any(dim=1)
 
 
-def _hand_samples(gripper: Gripper, width: float) -> list[list[float]]:
-    palm_front = gripper.palm_front
-    depths = [palm_front + gripper.finger_length * step / 4 for step in range(5)]
-    fingers = [
-        [0.0, side * (width / 2 + share * gripper.finger_thickness_at(gripper.tip_offset - z)), z]
-        for side in (-1, 1)
+def _samples(part: Part, width: float) -> list[tuple[float, float, float]]:
+    """Places in the middle plane of a finger, or 5 mm behind the front of the palm."""
+    if not part.side:
+        return [(0.0, share * part.thickness.full / 2, part.front - 0.005) for share in (-0.9, -0.45, 0.0, 0.45, 0.9)]
+    depths = [part.back + (part.front - part.back) * step / 4 for step in range(5)]
+    return [
+        (0.0, part.side * (width / 2 + share * part.thickness.at(part.front - z)), z)
         for share in (0.1, 0.5, 0.9)
         for z in depths
     ]
-    palm = [[0.0, gripper.palm_length / 2 * share, palm_front - 0.005] for share in (-0.9, -0.45, 0.0, 0.45, 0.9)]
-    return fingers + palm

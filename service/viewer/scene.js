@@ -47,9 +47,8 @@ void main() {
   pixel = vec4(colour * light, 1.0);
 }`;
 
-// The Panda hand about its TCP, metres: where the tips, the fingers' roots and the wrist lie along the direction of travel.
-const TIP = 0.0086, ROOT = -0.045, WRIST = -0.1034, FINGER = 0.012, HALF_BREADTH = 0.008;
-const PANDA_BEHIND_TCP = 0.1034;
+// Hands that were not chosen are drawn so much thinner.
+const THIN = 0.2;
 
 const plus = (a, b, s = 1) => a.map((value, axis) => value + s * b[axis]);
 const dot = (a, b) => a[0] * b[0] + a[1] * b[1] + a[2] * b[2];
@@ -99,11 +98,13 @@ export class Scene {
     this.count = points.length / 3;
     this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.pointBuffer);
     this.gl.bufferData(this.gl.ARRAY_BUFFER, points, this.gl.STATIC_DRAW);
-    this.showGrasps([]);
+    this.showGrasps([], []);
   }
 
-  showGrasps(grasps) {
+  // Shows hands made of `parts`, as the service describes them; a grasp also says where its TCP is.
+  showGrasps(grasps, parts) {
     this.grasps = grasps;
+    this.parts = parts;
     this.choose(0);
   }
 
@@ -111,7 +112,7 @@ export class Scene {
     if (!this.works) return;
     this.chosen = index;
     const vertices = [];
-    this.grasps.forEach((grasp, number) => hand(vertices, grasp, number === index));
+    this.grasps.forEach((grasp, number) => hand(vertices, grasp, this.parts, number === index));
     this.solidVertices = vertices.length / 6;
     this.gl.bindBuffer(this.gl.ARRAY_BUFFER, this.solidBuffer);
     this.gl.bufferData(this.gl.ARRAY_BUFFER, new Float32Array(vertices), this.gl.STATIC_DRAW);
@@ -196,25 +197,35 @@ export class Scene {
 }
 
 // Appends the triangles of a hand, 6 numbers a vertex: x, y, z and its colour, red to green by score; the chosen one is bright.
-function hand(vertices, grasp, chosen) {
-  // `hand_pose` is that of panda_hand in every frame convention.
-  const [x, y, z] = axes(grasp.hand_pose.quaternion_xyzw);
-  const tcp = plus(grasp.hand_pose.position, z, PANDA_BEHIND_TCP);
-  const tint = chosen ? [1, 0.62, 0.1] : [0.75 - 0.5 * grasp.score, 0.25 + 0.4 * grasp.score, 0.3];
-  const half = grasp.width / 2, thin = chosen ? 1 : 0.35;
-  const box = (low, high) => {
-    const corner = (i) => {
-      const local = [i & 1 ? high[0] : low[0], i & 2 ? high[1] : low[1], i & 4 ? high[2] : low[2]];
-      return plus(plus(plus(tcp, x, local[0]), y, local[1]), z, local[2]);
-    };
+// A part is drawn section by section. The palm is drawn as a bar between the fingers' backs with a wrist, or it would hide the scene.
+function hand(vertices, { tcp, quaternion, score, width }, parts, chosen) {
+  const [x, y, z] = axes(quaternion);
+  const tint = chosen ? [1, 0.62, 0.1] : [0.75 - 0.5 * score, 0.25 + 0.4 * score, 0.3];
+  const share = chosen ? 1 : THIN;
+  const place = ([a, b, c]) => plus(plus(plus(tcp, x, a), y, b), z, c);
+  // Between two rectangles, each a breadth along x, a beginning and an end along y, and a place along z.
+  const solid = (front, back) => {
+    const corners = [front, back].flatMap(({ breadth, low, high, z: at }) =>
+      [[-breadth, low], [breadth, low], [-breadth, high], [breadth, high]].map(([across, along]) => place([across / 2, along, at])));
     for (const [a, b, c, d] of [[0, 1, 3, 2], [4, 5, 7, 6], [0, 1, 5, 4], [2, 3, 7, 6], [0, 2, 6, 4], [1, 3, 7, 5]])
-      for (const i of [a, b, c, a, c, d]) vertices.push(...corner(i), ...tint);
+      for (const i of [a, b, c, a, c, d]) vertices.push(...corners[i], ...tint);
   };
-  const w = HALF_BREADTH * thin, f = FINGER * thin;
-  box([-w, half, ROOT], [w, half + f, TIP]);
-  box([-w, -half - f, ROOT], [w, -half, TIP]);
-  box([-w, -half - f, ROOT - f], [w, half + f, ROOT]);
-  box([-w, -f / 2, WRIST], [w, f / 2, ROOT - f]);
+  const fingers = parts.filter((part) => part.side !== 0);
+  for (const { side, sections } of fingers) {
+    const outlines = sections.map((section) => {
+      const inner = (side * width) / 2;
+      return { breadth: share * section.breadth, low: inner, high: inner + side * share * section.thickness, z: section.z };
+    });
+    outlines.slice(1).forEach((outline, number) => solid(outlines[number], outline));
+  }
+  const root = fingers[0]?.sections.at(-1);
+  for (const { sections } of parts.filter((part) => part.side === 0)) {
+    const front = sections[0].z, back = sections.at(-1).z;
+    const thick = share * root.thickness, reach = width / 2 + thick, breadth = share * root.breadth;
+    const across = { breadth, low: -reach, high: reach }, wrist = { breadth, low: -thick / 2, high: thick / 2 };
+    solid({ ...across, z: front }, { ...across, z: front - thick / 2 });
+    solid({ ...wrist, z: front - thick / 2 }, { ...wrist, z: back });
+  }
 }
 
 // The columns of a quaternion's rotation matrix.

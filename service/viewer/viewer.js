@@ -3,16 +3,19 @@ import { Scene } from "/viewer/scene.js";
 
 const EXAMPLE_OPTIONS = { viewpoint: [0.38, 0.55, 0.48], up: [0, 0, 1], support_height: 0.05, max_grasps: 10 };
 const OWN_OPTIONS = { viewpoint: [0, 0, 0], max_grasps: 10 };
+const PREGRASP_DISTANCE = 0.05; // metres; the page asks for it unless the options do
 
 const element = (id) => document.getElementById(id);
 const scene = new Scene(element("canvas"));
 let points = null; // Float32Array of x, y, z triples
 
 async function post(address, body, type, accept) {
-  const headers = { Accept: accept };
-  if (type) headers["Content-Type"] = type;
+  return request(address, { method: "POST", headers: { Accept: accept, ...(type && { "Content-Type": type }) }, body });
+}
+
+async function request(address, { headers = {}, ...options } = {}) {
   if (element("key").value) headers["X-API-Key"] = element("key").value;
-  const answer = await fetch(address, { method: "POST", headers, body });
+  const answer = await fetch(address, { ...options, headers });
   if (answer.ok) return answer;
   const problem = await answer.json().catch(() => ({ title: answer.statusText }));
   throw new Error(`${answer.status}: ${problem.detail ?? problem.title}`);
@@ -62,20 +65,32 @@ async function open(file, options) {
 
 async function ask() {
   const options = readOptions();
+  options.pregrasp_distance ??= PREGRASP_DISTANCE;
   const query = Object.entries(options).map(([name, value]) => `${name}=${encodeURIComponent(JSON.stringify(value))}`);
   say("Asking ...");
   const answer = await post(`/grasps?${query.join("&")}`, points, "application/octet-stream", "application/json");
   const reply = await answer.json();
+  const { gripper } = await (await request("/model")).json();
   const { points: posted, candidates, collision_free: free } = reply.counts;
   const found = reply.grasps.length ? `${reply.grasps.length} grasps` : `No grasp: ${reply.reason.replaceAll("_", " ")}`;
   say(`${found} · ${posted} points, ${candidates} candidates, ${free} of them free · ${Math.round(reply.timings_ms.total)} ms`);
+  scene.showGrasps(reply.grasps.map((grasp) => seen(grasp, options.pregrasp_distance)), gripper.parts);
   list(reply, options.frame_convention ?? "panda");
 }
 
 function forget() {
   points = null;
   element("ask").disabled = true;
+  scene.showGrasps([], []);
   list({ grasps: [], warnings: [] }, "panda");
+}
+
+// A grasp as the scene draws it: `pregrasp` is a pose of the TCP in every frame convention.
+function seen({ pregrasp, score, width }, distance) {
+  const [x, y, z, w] = pregrasp.quaternion_xyzw;
+  const travel = [2 * (x * z + y * w), 2 * (y * z - x * w), 1 - 2 * (x * x + y * y)];
+  const tcp = pregrasp.position.map((value, axis) => value + distance * travel[axis]);
+  return { tcp, quaternion: pregrasp.quaternion_xyzw, score, width };
 }
 
 function list(reply, convention) {
@@ -91,7 +106,6 @@ function list(reply, convention) {
   });
   document.querySelector("#grasps tbody").replaceChildren(...rows);
   element("grasps").hidden = element("chosen").hidden = rows.length === 0;
-  scene.showGrasps(reply.grasps);
 
   function choose(index) {
     rows.forEach((row, number) => row.classList.toggle("chosen", number === index));

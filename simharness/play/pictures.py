@@ -135,14 +135,14 @@ def hand_lines(T_world_grasp: Float[np.ndarray, "4 4"], width: float) -> Float64
 
     Two fingers at the opening `width`, the bar that joins them, and the wrist.
     """
-    tip, bar = PANDA.tip_offset, PANDA.tip_offset - PANDA.finger_length
-    half = width / 2
+    left, right, palm = PANDA.parts
+    (inner, _), (other, _) = (finger.span(0.0, width) for finger in (left, right))
     segments = np.array(
         [
-            [[0, half, bar], [0, half, tip]],
-            [[0, -half, bar], [0, -half, tip]],
-            [[0, -half, bar], [0, half, bar]],
-            [[0, 0, bar - 0.045], [0, 0, bar]],
+            [[0, inner, left.back], [0, inner, left.front]],
+            [[0, other, right.back], [0, other, right.front]],
+            [[0, other, palm.front], [0, inner, palm.front]],
+            [[0, 0, palm.front - 0.045], [0, 0, palm.front]],
         ]
     )
     matrix = np.asarray(T_world_grasp, dtype=np.float64)

@@ -3,6 +3,7 @@
 from tesnet.geometry.camera import CameraIntrinsics
 from tesnet.geometry.grasp import FRAME_CONVENTIONS, FrameConvention, GraspSet
 from tesnet.geometry.gripper import HAND_TO_TCP, PANDA, Gripper
+from tesnet.geometry.part import Extent, Part, PartName, Section
 from tesnet.geometry.pose import Pose, quaternions_xyzw, unit
 
 __all__ = [
@@ -10,10 +11,14 @@ __all__ = [
     "HAND_TO_TCP",
     "PANDA",
     "CameraIntrinsics",
+    "Extent",
     "FrameConvention",
     "GraspSet",
     "Gripper",
+    "Part",
+    "PartName",
     "Pose",
+    "Section",
     "quaternions_xyzw",
     "unit",
 ]

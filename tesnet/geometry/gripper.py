@@ -1,4 +1,4 @@
-"""The parallel gripper as the collision check and the candidate generator see it."""
+"""The parallel gripper: its sizes, and the parts that follow from them."""
 
 from __future__ import annotations
 
@@ -7,6 +7,8 @@ from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
+
+from tesnet.geometry.part import Extent, Part
 
 HAND_TO_TCP = 0.1034
 """Metres from the origin of `panda_hand` to the TCP, along z."""
@@ -108,6 +110,25 @@ class Gripper:
         """Where, along z, the palm's face between the fingers lies."""
         return self.tip_offset - self.finger_length
 
+    @property
+    def parts(self) -> tuple[Part, Part, Part]:
+        """The solids that the hand is made of: left finger (+y), right finger and palm."""
+        thickness = Extent(self.finger_thickness, self.finger_tip_thickness, self.finger_taper)
+        breadth, tip_breadth = Extent.constant(self.finger_breadth), self.finger_tip_breadth
+        front, back = self.tip_offset, self.palm_front
+        return (
+            Part("left finger", 1, front, back, breadth, thickness, tip_breadth),
+            Part("right finger", -1, front, back, breadth, thickness, tip_breadth),
+            Part(
+                "palm",
+                0,
+                back,
+                back - self.palm_depth,
+                Extent(self.palm_breadth, self.palm_front_breadth, self.palm_taper),
+                Extent.constant(self.palm_length),
+            ),
+        )
+
     # Operations
 
     def corners(self, width: float) -> NDArray[np.float64]:
@@ -116,36 +137,7 @@ class Gripper:
         Args:
             width: the opening between the pads, metres.
         """
-        tip, root = self.tip_offset, self.palm_front
-        taper = tip - self.finger_taper
-        # The tip is rounded over its last 7 mm.
-        finger = [
-            (self.finger_tip_breadth, self.finger_tip_thickness, tip),
-            (self.finger_breadth, self.finger_thickness_at(0.007), tip - 0.007),
-            (self.finger_breadth, self.finger_thickness, taper),
-            (self.finger_breadth, self.finger_thickness, root),
-        ]
-        palm = [
-            (self.palm_front_breadth, self.palm_length, root),
-            (self.palm_breadth, self.palm_length, root - self.palm_taper),
-            (self.palm_breadth, self.palm_length, root - self.palm_depth),
-        ]
-        points = [
-            (side_x * breadth / 2, side_y * y, z)
-            for breadth, thickness, z in finger
-            for y in (width / 2, width / 2 + thickness)
-            for side_x in (-1, 1)
-            for side_y in (-1, 1)
-        ]
-        points += [
-            (sx * breadth / 2, sy * length / 2, z) for breadth, length, z in palm for sx in (-1, 1) for sy in (-1, 1)
-        ]
-        return np.array(points)
-
-    def finger_thickness_at(self, behind_tip: float) -> float:
-        """Extent of one finger along y at a distance behind its tip, metres."""
-        share = min(1.0, behind_tip / self.finger_taper)
-        return self.finger_tip_thickness + share * (self.finger_thickness - self.finger_tip_thickness)
+        return np.concatenate([part.corners(width) for part in self.parts])
 
 
 PANDA = Gripper()

@@ -18,7 +18,7 @@ from torch import Tensor, nn
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.collision import points_in_grasp_frames
-from tesnet.geometry import PANDA
+from tesnet.geometry import PANDA, Gripper
 from tesnet.layers import PointTransformerConv, SAGEConv
 from tesnet.patches import Patches, group, pool
 from tesnet.visibility import depth_behind, outside
@@ -29,13 +29,6 @@ _REGION_INPUTS = 7
 _CANDIDATE_INPUTS = 23
 _LENGTH = 0.02
 """Metres that count as 1 in the network's inputs."""
-
-_ENDS = [(0.0, 0.0, 0.0)] + [
-    (0.0, side * y, z)
-    for y, z in ((0.052, PANDA.tip_offset), (0.052, PANDA.palm_front), (0.1, PANDA.palm_front - 0.01))
-    for side in (-1, 1)
-]
-"""The TCP, and tips, roots of the fingers and ends of the palm, outermost, in the grasp frame: metres."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -171,6 +164,7 @@ class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
+    ends: Tensor
     probes: Tensor
 
     def __init__(self, config: TesNetConfig) -> None:
@@ -190,7 +184,8 @@ class TesNet(nn.Module):
         self.contact = nn.Linear(f, config.head_channels[0], bias=False)
         self.pooled = nn.Linear(2 * config.region_channels[1], config.head_channels[0], bias=False)
         self.candidate = nn.Linear(_CANDIDATE_INPUTS, config.head_channels[0])
-        self.register_buffer("probes", _probes(), persistent=False)
+        self.register_buffer("ends", _ends(PANDA), persistent=False)
+        self.register_buffer("probes", _probes(PANDA), persistent=False)
         self.hidden_space = nn.Sequential(
             nn.Linear(2 * len(self.probes), config.probe_channels),
             nn.ReLU(),
@@ -255,7 +250,7 @@ class TesNet(nn.Module):
             self.pooled(torch.cat([closing, around], dim=1))
             + self.approach(features.points)[candidates.approach]
             + self.contact(features.points)[candidates.contact]
-            + self.candidate(_candidate_inputs(cloud, candidates, totals, sign))
+            + self.candidate(_candidate_inputs(self.ends, cloud, candidates, totals, sign))
             + self.situation(features.context)
             + self.hidden_space(_probe_inputs(self.probes, cloud, poses, sign))
         )
@@ -297,9 +292,11 @@ def edge_features(points: Tensor, normals: Tensor, neighbours: Tensor) -> Tensor
     )
 
 
-def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tensor, sign: Tensor) -> Tensor:
+def _candidate_inputs(
+    ends: Tensor, cloud: PreparedCloud, candidates: Candidates, totals: Tensor, sign: Tensor
+) -> Tensor:
     """(C, 23): the pair, numbers of points near, n_a, line of sight and up, all in the grasp frame, the height, and how
-    far the hand reaches out of the workspace.
+    far the ends of the hand (7, 3) reach out of the workspace.
     """
     poses = candidates.Ts_canonical_grasp
     rotation = poses[:, :3, :3]
@@ -315,8 +312,8 @@ def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tens
         if cloud.support_height is not None:
             height[:, 0] = (poses[:, :3, 3] @ cloud.up - cloud.support_height) / (5 * _LENGTH)
             height[:, 1] = 1
-    ends = torch.tensor(_ENDS, device=poses.device) @ rotation.transpose(1, 2) + poses[:, None, :3, 3]
-    out = (outside(cloud, ends) / _LENGTH).clamp(-2, 2)
+    places = ends @ rotation.transpose(1, 2) + poses[:, None, :3, 3]
+    out = (outside(cloud, places) / _LENGTH).clamp(-2, 2)
     return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height, out], 1)
 
 
@@ -325,23 +322,32 @@ def _mirror(sign: Tensor) -> Tensor:
     return torch.stack([sign, torch.ones_like(sign), torch.ones_like(sign)], dim=1)
 
 
-def _probes() -> Tensor:
+def _ends(hand: Gripper) -> Tensor:
+    """(7, 3) the TCP, and tips, roots of the fingers and ends of the palm, outermost, in the grasp frame: metres."""
+    finger, _, palm = hand.parts
+    outer = hand.max_width / 2 + 0.012
+    outermost = ((outer, finger.front), (outer, finger.back), (palm.thickness.full / 2 - 0.002, palm.front - 0.01))
+    return torch.tensor([(0.0, 0.0, 0.0)] + [(0.0, side * y, z) for y, z in outermost for side in (-1, 1)])
+
+
+def _probes(hand: Gripper) -> Tensor:
     """(S, 3) places on and around the open hand, in the grasp frame, where it matters what the camera did not see."""
-    tip, root = PANDA.tip_offset, PANDA.palm_front
-    half = PANDA.max_width / 2
+    finger, _, palm = hand.parts
+    tip, half = finger.front, hand.max_width / 2
+    x = finger.breadth.full / 2 - 0.0015
     fingers = [
-        (x, side * (half + across), z)
-        for x in (-0.009, 0.009)
+        (x * side_x, side * (half + across), z)
+        for side_x in (-1, 1)
         for side in (-1, 1)
-        for z in (tip, -0.003, -0.014, -0.026, root)
+        for z in (tip, tip - 0.0116, tip - 0.0226, tip - 0.0346, finger.back)
         for across in (0.001, 0.012, 0.024)
     ]
     between = [
         (x, y, z) for x in (-0.008, 0.008) for y in (-0.03, -0.015, 0.0, 0.015, 0.03) for z in (tip, -0.01, -0.025)
     ]
     ahead = [(0.0, y, tip + 0.012) for y in (-0.05, -0.025, 0.0, 0.025, 0.05)]
-    palm = [(x, y, root - 0.01) for x in (-0.02, 0.02) for y in (-0.09, -0.045, 0.0, 0.045, 0.09)]
-    return torch.tensor(fingers + between + ahead + palm)
+    behind = [(x, y, palm.front - 0.01) for x in (-0.02, 0.02) for y in (-0.09, -0.045, 0.0, 0.045, 0.09)]
+    return torch.tensor(fingers + between + ahead + behind)
 
 
 def _probe_inputs(probes: Tensor, cloud: PreparedCloud, poses: Tensor, sign: Tensor) -> Tensor:

@@ -2,12 +2,15 @@
 
 from __future__ import annotations
 
+from dataclasses import asdict
+
 import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
 from service.schemas import ModelResponse
+from tesnet.geometry import PANDA
 from tests.service.wire import post_octets
 
 
@@ -19,6 +22,9 @@ def test_model_tells_networks_frames_gripper_and_limits(http: httpx.Client, clou
     assert model.limits.max_points == 1_000_000
     assert model.limits.max_body_bytes == 64 * 2**20
     assert model.gripper.max_width == 0.08
+    for told, part in zip(model.gripper.parts, PANDA.parts, strict=True):
+        assert (told.name, told.side) == (part.name, part.side)
+        assert [section.model_dump() for section in told.sections] == [asdict(section) for section in part.sections]
     assert model.models[0].card
     assert model.device == "cpu"
 

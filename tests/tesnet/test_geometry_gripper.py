@@ -21,14 +21,17 @@ def test_the_corners_are_the_pandas(width: float) -> None:
 
 
 def test_the_open_hand_is_133_mm_wide_at_the_fingers() -> None:
-    assert 0.08 + 2 * PANDA.finger_thickness_at(0.04) == pytest.approx(0.133, abs=5e-4)
+    for finger, side in zip(PANDA.parts, (1, -1), strict=False):
+        assert finger.corners(0.08)[:, 1].max() == pytest.approx(side * (0.133 if side > 0 else 0.08) / 2, abs=5e-4)
 
 
 def test_fingers_taper_towards_the_tip() -> None:
-    thickness = [PANDA.finger_thickness_at(behind) for behind in np.linspace(0, 0.046, 20)]
-    assert thickness == sorted(thickness)
-    assert thickness[0] == pytest.approx(PANDA.finger_tip_thickness)
-    assert thickness[-1] == pytest.approx(PANDA.finger_thickness)
+    finger = PANDA.parts[0]
+    assert [section.thickness for section in finger.sections] == sorted(s.thickness for s in finger.sections)
+    assert finger.sections[0].thickness == pytest.approx(PANDA.finger_tip_thickness)
+    assert finger.sections[0].breadth == PANDA.finger_tip_breadth
+    assert finger.sections[-1].thickness == pytest.approx(PANDA.finger_thickness)
+    assert finger.front - finger.back == pytest.approx(PANDA.finger_length)
 
 
 def test_half_a_turn_about_z_maps_the_hand_onto_itself() -> None:

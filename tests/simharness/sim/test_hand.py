@@ -3,13 +3,16 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
+from numpy.typing import NDArray
+from scipy.spatial import ConvexHull
 
-from simharness.sim.hand import MAX_WIDTH, Hand
-from simharness.sim.world import World
-from tesnet.geometry import HAND_TO_TCP, Pose
+from simharness.sim.hand import FINGER_BASE, MAX_WIDTH, Hand
+from simharness.sim.world import World, data_path
+from tesnet.geometry import HAND_TO_TCP, PANDA, Pose
 
 pytestmark = pytest.mark.sim
 
@@ -47,6 +50,29 @@ def test_the_fingertips_are_112_mm_from_the_hands_base(world: World) -> None:
     assert gap is not None
     base_height = 0.1 + HAND_TO_TCP
     assert base_height - gap == pytest.approx(0.112 + MARGIN, abs=0.0005)
+
+
+@pytest.mark.parametrize("width", [0.08, 0.0])
+def test_the_published_meshes_are_the_hands_parts(width: float) -> None:
+    """Its sizes were measured on these meshes; its body is 1.8 mm off the middle along y."""
+    meshes = data_path() / "franka_panda" / "meshes" / "collision"
+    palm, finger = (_vertices(meshes / f"{name}.obj") for name in ("hand", "finger"))
+    finger += [0.0, 0.0, FINGER_BASE]
+    opened = width / 2 * np.array([0.0, 1.0, 0.0])
+    solids = (finger + opened, finger * [-1, -1, 1] - opened, palm)
+    for part, solid in zip(PANDA.parts, solids, strict=True):
+        planes = ConvexHull(part.corners(width)).equations
+        # The finger's root reaches into the palm, which covers it.
+        in_reach = solid[solid[:, 2] - HAND_TO_TCP > part.back] - [0.0, 0.0, HAND_TO_TCP]
+        outside = (in_reach @ planes[:, :3].T + planes[:, 3]).max(axis=1)
+        assert outside.max() < 0.0021
+        # And no part is much larger than its mesh.
+        assert np.abs(in_reach.max(axis=0) - part.corners(width).max(axis=0)).max() < 0.006
+
+
+def _vertices(path: Path) -> NDArray[np.float64]:
+    rows = [line.split()[1:4] for line in path.read_text().splitlines() if line.startswith("v ")]
+    return np.array(rows, dtype=np.float64)
 
 
 @pytest.mark.parametrize("width", [0.08, 0.04])
