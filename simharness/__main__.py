@@ -26,9 +26,9 @@ from simharness.errors import RunBroken, SimError, UsageError
 from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
 from simharness.play.metrics import summarise
 from simharness.play.photographer import attempts_to_show, keep_only, take_pictures
-from simharness.play.records import RoundRecord, RunSettings
+from simharness.play.records import RoundRecord, Run, RunSettings
 from simharness.play.replay import find_attempt, replay
-from simharness.play.run import Hooks, Run, run
+from simharness.play.run import Hooks, run
 from simharness.report.causes import failures, failures_report, failures_table
 from simharness.report.page import page
 from simharness.report.report import package_versions, percent, report, table

@@ -292,6 +292,32 @@ class RoundRecord:
         )
 
 
+@dataclass(frozen=True, slots=True)
+class Run:
+    """A run that is over, complete or not.
+
+    Args:
+        settings: what decided its results.
+        workers: processes that played it.
+        model: the network that answered; None until it was asked.
+        serving: where; None until it was asked.
+        rounds: the finished rounds by seed and number.
+        stopped_by: what broke the run off; None when it was not.
+    """
+
+    settings: RunSettings
+    workers: int
+    model: ModelRecord | None
+    serving: Serving | None
+    rounds: tuple[RoundRecord, ...]
+    stopped_by: str | None
+
+    @property
+    def complete(self) -> bool:
+        """Whether every round was played."""
+        return len(self.rounds) == len(self.settings.seeds) * self.settings.rounds
+
+
 def _latency_to_json(latency: Latency | None) -> dict[str, float | None] | None:
     return None if latency is None else asdict(latency)
 

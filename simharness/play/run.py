@@ -18,7 +18,7 @@ from simharness.play.crew import Crew, Done, Emit, Event, Work, crew
 from simharness.play.folder import SERVICE_LOG, RunFolder
 from simharness.play.photographer import Photographer, Picture
 from simharness.play.planner import HttpPlanner
-from simharness.play.records import ModelRecord, RoundRecord, RunSettings, Serving
+from simharness.play.records import ModelRecord, RoundRecord, Run, RunSettings, Serving
 from simharness.play.round import Attempted, Observed, play_round
 from simharness.play.server import NUM_THREADS, LocalService
 from simharness.sim.objects import ObjectModel
@@ -27,30 +27,6 @@ _LOOK_AFTER_SERVICE_S = 1.0
 
 _RoundKey = tuple[int, int]
 """A run seed and a round's number."""
-
-
-@dataclass(frozen=True, slots=True)
-class Run:
-    """A run under way or over.
-
-    Args:
-        model: the network that answered; None until it was asked.
-        serving: where; None until it was asked.
-        rounds: the finished rounds by seed and number.
-        stopped_by: what broke the run off; None when it was not.
-    """
-
-    settings: RunSettings
-    workers: int
-    model: ModelRecord | None
-    serving: Serving | None
-    rounds: tuple[RoundRecord, ...]
-    stopped_by: str | None
-
-    @property
-    def complete(self) -> bool:
-        """Whether every round was played."""
-        return len(self.rounds) == len(self.settings.seeds) * self.settings.rounds
 
 
 @dataclass(frozen=True, slots=True)
@@ -94,50 +70,113 @@ def run(
     Raises:
         UsageError: the folder, the address or the model's name cannot be used, or the recorded run was another.
     """
-    done = {(record.seed, record.round): record for record in folder.prepare(settings, resume)}
-    todo = [
-        (seed, number) for seed in settings.seeds for number in range(settings.rounds) if (seed, number) not in done
-    ]
-    model: ModelRecord | None = None
-    serving: Serving | None = None
+    log = _Log(settings, folder, hooks, resume=resume)
     stopped_by = None
     try:
-        if todo:
-            with ExitStack() as stack:
-                service = (
-                    stack.enter_context(LocalService(settings.model, folder.path / SERVICE_LOG))
-                    if url is None
-                    else None
-                )
-                address = service.url if service is not None else str(url)
-                with HttpPlanner(address, settings.model, settings.max_grasps) as planner:
-                    model, document = planner.model()
-                serving = Serving(url, NUM_THREADS if service is not None else None, document.get("device"))
-                folder.start(settings, model, serving)
-                hooks.started(tuple(done.values()))
-                # On a cluster nobody reaches this machine's service, so workers there have their own.
-                reached = address if ray is None else url
-                task = _Rounds(settings, objects, reached, model, hooks.event is not None)
-                rounds = stack.enter_context(crew(task, min(workers, len(todo)), ray))
-                for message in _play(rounds, todo, service):
-                    if isinstance(message, RoundRecord):
-                        folder.append(message)
-                        done[message.seed, message.round] = message
-                        hooks.round_done(message)
-                    elif isinstance(message, Picture):
-                        folder.add_picture(message.name, message.content)
-                    elif hooks.event is not None:
-                        hooks.event(message)
+        if log.todo:
+            _play(log, settings, objects, workers, url, ray, watched=hooks.event is not None)
         else:
-            _, model, serving = folder.read_run()
-            hooks.started(tuple(done.values()))
+            log.reopen()
     except RunBroken as error:
         stopped_by = str(error)
     except KeyboardInterrupt:
         stopped_by = "interrupted"
-    records = tuple(done[key] for key in sorted(done))
-    folder.rewrite(records)
-    return Run(settings, workers, model, serving, records, stopped_by)
+    return Run(settings, workers, log.model, log.serving, log.close(), stopped_by)
+
+
+class _Log:
+    """A run's folder and listeners while it is played: what is done, what is left, and who answers.
+
+    Args:
+        settings: of the run.
+        folder: where everything is written down.
+        hooks: who is told.
+        resume: whether the folder's rounds count.
+
+    Raises:
+        UsageError: the folder cannot be used, or the recorded run was another.
+    """
+
+    def __init__(self, settings: RunSettings, folder: RunFolder, hooks: Hooks, *, resume: bool) -> None:
+        self._settings = settings
+        self._folder = folder
+        self._hooks = hooks
+        self._done = {(record.seed, record.round): record for record in folder.prepare(settings, resume)}
+        self.model: ModelRecord | None = None
+        self.serving: Serving | None = None
+
+    @property
+    def service_log(self) -> Path:
+        """File for the output of a service that is started for the run."""
+        return self._folder.path / SERVICE_LOG
+
+    @property
+    def todo(self) -> list[_RoundKey]:
+        """The rounds that are left, in order."""
+        keys = [(seed, number) for seed in self._settings.seeds for number in range(self._settings.rounds)]
+        return [key for key in keys if key not in self._done]
+
+    def open(self, model: ModelRecord, serving: Serving) -> None:
+        """Begin to play, with who answers.
+
+        Raises:
+            UsageError: the folder's rounds were played with other weights.
+        """
+        self.model, self.serving = model, serving
+        self._folder.start(self._settings, model, serving)
+        self._hooks.started(tuple(self._done.values()))
+
+    def reopen(self) -> None:
+        """Nothing is left to play; who answered is what the folder says."""
+        _, self.model, self.serving = self._folder.read_run()
+        self._hooks.started(tuple(self._done.values()))
+
+    def take(self, message: RoundRecord | Picture | Observed | Attempted) -> None:
+        """What a worker said: a finished round, or something on the way to one."""
+        if isinstance(message, RoundRecord):
+            self._folder.append(message)
+            self._done[message.seed, message.round] = message
+            self._hooks.round_done(message)
+        elif isinstance(message, Picture):
+            self._folder.add_picture(message.name, message.content)
+        elif self._hooks.event is not None:
+            self._hooks.event(message)
+
+    def close(self) -> tuple[RoundRecord, ...]:
+        """Put the files in the order of seeds and rounds, in which rounds seldom finish; the finished rounds."""
+        records = tuple(self._done[key] for key in sorted(self._done))
+        self._folder.rewrite(records)
+        return records
+
+
+def _play(
+    log: _Log,
+    settings: RunSettings,
+    objects: tuple[ObjectModel, ...],
+    workers: int,
+    url: str | None,
+    ray: str | None,
+    *,
+    watched: bool,
+) -> None:
+    """Play the rounds that are left.
+
+    Raises:
+        RunBroken: the service or a worker failed.
+        UsageError: the address or the model's name cannot be used, or other weights played the folder's rounds.
+    """
+    todo = log.todo
+    with ExitStack() as stack:
+        service = stack.enter_context(LocalService(settings.model, log.service_log)) if url is None else None
+        address = service.url if service is not None else str(url)
+        with HttpPlanner(address, settings.model, settings.max_grasps) as planner:
+            model, document = planner.model()
+        log.open(model, Serving(url, NUM_THREADS if service is not None else None, document.get("device")))
+        # On a cluster nobody reaches this machine's service, so workers there have their own.
+        task = _Rounds(settings, objects, address if ray is None else url, model, watched)
+        rounds = stack.enter_context(crew(task, min(workers, len(todo)), ray))
+        for message in _messages(rounds, todo, service):
+            log.take(message)
 
 
 @dataclass(frozen=True, slots=True)
@@ -206,7 +245,7 @@ class _Rounds:
             )
 
 
-def _play(rounds: Crew[_RoundKey], todo: Sequence[_RoundKey], service: LocalService | None) -> Iterator[Any]:
+def _messages(rounds: Crew[_RoundKey], todo: Sequence[_RoundKey], service: LocalService | None) -> Iterator[Any]:
     """Records of the rounds, and what was emitted on the way, as they come.
 
     Raises:

@@ -11,8 +11,7 @@ from typing import Any
 
 from simharness.play.metrics import Rate, Summary, summarise
 from simharness.play.photographer import FAILURES, FIRST_ROUNDS, VIEWS, picture_name
-from simharness.play.records import AttemptRecord
-from simharness.play.run import Run
+from simharness.play.records import AttemptRecord, Run
 from simharness.report.report import percent, times, title
 
 _OUTCOME_COLOURS = {
@@ -67,7 +66,7 @@ def page(run: Run, content: Mapping[str, Any], shown: Sequence[AttemptRecord], p
     summary = summarise(run.rounds)
     sections = [
         f"<h1>Clutter removal, {run.settings.scene} scenes</h1>",
-        f'<p class="subtitle">{escape(title(run).replace(" | ", " · "))}</p>',
+        f'<p class="subtitle">{escape(title(run.settings, run.model).replace(" | ", " · "))}</p>',
         "" if run.complete else _warning(run),
         '<div class="cards">',
         _rate_card("Grasp success rate (GSR)", summary.gsr, "grasps attempted"),
@@ -94,7 +93,7 @@ def page(run: Run, content: Mapping[str, Any], shown: Sequence[AttemptRecord], p
     return (
         '<!DOCTYPE html>\n<html lang="en">\n<head>\n<meta charset="utf-8">\n'
         '<meta name="viewport" content="width=device-width, initial-scale=1">\n'
-        f"<title>{escape(title(run))}</title>\n<style>{_style()}</style>\n</head>\n"
+        f"<title>{escape(title(run.settings, run.model))}</title>\n<style>{_style()}</style>\n</head>\n"
         f"<body>\n<main>\n{body}\n</main>\n</body>\n</html>\n"
     )
 

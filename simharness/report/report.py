@@ -9,8 +9,7 @@ from importlib import metadata
 from typing import Any
 
 from simharness.play.metrics import Percentiles, Rate, Summary, summarise
-from simharness.play.records import OBJECTS_PER_ROUND
-from simharness.play.run import Run
+from simharness.play.records import OBJECTS_PER_ROUND, ModelRecord, Run, RunSettings
 
 _PACKAGES = ("tes-net", "numpy", "pybullet", "scipy", "trimesh", "pillow", "httpx", "torch")
 
@@ -65,7 +64,7 @@ def table(run: Run) -> str:
         for seed in run.settings.seeds:
             rows += _rate_rows(summarise(record for record in run.rounds if record.seed == seed), f" seed {seed}")
     lines = [
-        title(run),
+        title(run.settings, run.model),
         "",
         *aligned(rows),
         "",
@@ -85,17 +84,15 @@ def aligned(rows: Sequence[Sequence[str]]) -> list[str]:
     return ["  ".join(cell.ljust(width) for cell, width in zip(row, widths, strict=True)).rstrip() for row in rows]
 
 
-def title(run: Run) -> str:
-    """The run in one line."""
-    settings = run.settings
-    model = settings.model if run.model is None else f"{run.model.name} {run.model.version}"
+def title(settings: RunSettings, model: ModelRecord | None) -> str:
+    """A run in one line; the model by the name it was asked for where it has not answered."""
     return " | ".join(
         [
             f"{settings.scene} scenes",
             f"objects {settings.objects}",
             f"camera {settings.camera}",
             f"executor {settings.executor}",
-            model,
+            settings.model if model is None else f"{model.name} {model.version}",
             f"seed{'s' if len(settings.seeds) > 1 else ''} {' '.join(map(str, settings.seeds))}",
         ]
     )

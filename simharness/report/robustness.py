@@ -13,8 +13,7 @@ from typing import Any, Literal, get_args
 
 from simharness.errors import UsageError
 from simharness.play.metrics import Rate, Summary, summarise
-from simharness.play.records import ModelRecord, RunSettings
-from simharness.play.run import Run
+from simharness.play.records import ModelRecord, Run, RunSettings
 from simharness.report.plot import Panel, plot
 from simharness.report.report import numbers, title
 
@@ -176,7 +175,7 @@ class Study:
 
     @property
     def _title(self) -> str:
-        return title(Run(self._settings, 1, self._model, None, (), None)).replace(" | ", ", ")
+        return title(self._settings, self._model).replace(" | ", ", ")
 
     def _panel(self, axis: Axis) -> Panel:
         def rates(of: Literal["gsr", "dr"]) -> list[Rate | None]:

@@ -24,8 +24,7 @@ from simharness.play.pictures import (
     segmentation_colours,
     widen,
 )
-from simharness.play.records import ModelRecord, RoundRecord, Serving
-from simharness.play.run import Run
+from simharness.play.records import ModelRecord, RoundRecord, Run, Serving
 from simharness.report.page import page
 from simharness.report.report import package_versions, report, table
 from tesnet.geometry import PANDA, Pose
