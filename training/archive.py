@@ -22,6 +22,7 @@ from tqdm import tqdm
 from simharness.play.crew import Emit, Work, crew
 from simharness.sim.camera import PRESET_NOISE, Preset, observe_from, sample_camera
 from simharness.sim.objects import ObjectModel, load_object_set
+from simharness.sim.outcomes import OUTCOME_KINDS
 from simharness.sim.scene import restore_scene
 from simharness.sim.world import World
 from tesnet import cloud
@@ -29,7 +30,7 @@ from tesnet.candidates import grasp_poses
 from tesnet.cloud import nearest_neighbours
 from tesnet.geometry import Pose
 from training.generate import is_free, observed_query
-from training.views import OUTCOMES, LabelledView, LabelsError, count_outcomes, load_scene, save_scene, scene_files
+from training.views import LabelledView, LabelsError, count_outcomes, load_scene, save_scene, scene_files
 
 RESOLUTION = 2e-5
 """Metres to which positions are kept."""
@@ -74,7 +75,7 @@ def pack(folders: Sequence[Path], out: Path) -> dict[str, Any]:
     if stale := sorted(out.glob("labels_*.npz")):
         raise LabelsError(f"{out} already holds {stale[0].name}; remove it, or choose another folder")
     files = scene_files(folders)
-    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+    counts = np.zeros(len(OUTCOME_KINDS), dtype=np.int64)
     for part, first in enumerate(range(0, len(files), _SCENES_PER_PART)):
         scenes = [_read_scene(path) for path in files[first : first + _SCENES_PER_PART]]
         counts += count_outcomes(view.outcomes for _, views in scenes for view in views)
@@ -82,7 +83,7 @@ def pack(folders: Sequence[Path], out: Path) -> dict[str, Any]:
     return {
         "scenes": len(files),
         "labels": int(counts.sum()),
-        "outcomes": dict(zip(OUTCOMES, counts.tolist(), strict=True)),
+        "outcomes": dict(zip(OUTCOME_KINDS, counts.tolist(), strict=True)),
         "bytes": sum(path.stat().st_size for path in out.glob("labels_*.npz")),
     }
 

@@ -28,6 +28,7 @@ from simharness.sim.camera import Observation, Preset, observe
 from simharness.sim.execute import label_strict, snapshot_of
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel, load_object_set
+from simharness.sim.outcomes import OUTCOME_KINDS
 from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT, describe, make_scene
 from simharness.sim.world import World
 from tesnet import candidates, cloud, networks
@@ -36,7 +37,7 @@ from tesnet.geometry import PANDA
 from tesnet.networks import Network
 from tesnet.predictor import APPROACH_DISTANCE
 from tesnet.query import GraspQuery
-from training.views import OUTCOMES, LabelledView, LabelsError, count_outcomes, pairs_of, save_scene, scene_files
+from training.views import LabelledView, LabelsError, count_outcomes, pairs_of, save_scene, scene_files
 
 _HEAR_S = 1.0
 
@@ -94,7 +95,7 @@ def generate(
     _claim(out, settings, resume)
     object_sets(config)  # fail here, not in a worker
     done = {int(path.stem.split("_")[1]) for path in out.glob("scene_*.npz")}
-    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+    counts = np.zeros(len(OUTCOME_KINDS), dtype=np.int64)
     for path in scene_files([out]) if done else []:
         with np.load(path, allow_pickle=False) as stored:
             counts += stored["counts"]
@@ -123,7 +124,7 @@ def generate(
         "settings": settings,
         "labels": int(counts.sum()),
         "scenes": len(list(out.glob("scene_*.npz"))),
-        "outcomes": dict(zip(OUTCOMES, counts.tolist(), strict=True)),
+        "outcomes": dict(zip(OUTCOME_KINDS, counts.tolist(), strict=True)),
         "this_run": {
             "labels": fresh,
             "seconds": round(time.monotonic() - started, 1),
@@ -281,7 +282,7 @@ def _label_view(
         pairs=pairs_of(prepared, picked),
         approach=picked.approach,
         contact=picked.contact,
-        outcomes=torch.tensor([OUTCOMES.index(kind) for kind in kinds], dtype=torch.uint8),
+        outcomes=torch.tensor([OUTCOME_KINDS.index(kind) for kind in kinds], dtype=torch.uint8),
         collision_free=free[which],
         scene=config.scene,
     )

@@ -14,12 +14,10 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
+from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
 from tesnet.cloud import PreparationConfig, PreparedCloud, estimate_normals, orient_normals
 from tesnet.geometry import Pose
-
-OUTCOMES = ("success", "pregrasp", "approach", "slip", "drop")
-"""Codes of the stored outcomes, by position."""
 
 
 class LabelsError(Exception):
@@ -35,7 +33,7 @@ class LabelledView:
         pairs: (C, 4, 3) approach point, contact point, and directions of closing and travel of each candidate.
         approach, contact: (C,) the points of the cloud nearest to those of the pairs: where the cloud was rendered
             again, no point lies just there.
-        outcomes: (C,) codes into `OUTCOMES`.
+        outcomes: (C,) codes into `OUTCOME_KINDS`.
         collision_free: (C,) whether the observed cloud left the hand's way free: such candidates the service scores.
         scene: kind of the scene, `packed` or `pile`.
     """
@@ -56,14 +54,14 @@ class LabelledView:
     @property
     def success(self) -> torch.Tensor:
         """(C,) bool."""
-        return self.outcomes == 0
+        return self.outcomes == OUTCOME_KINDS.index("success")
 
 
 def count_outcomes(outcomes: Iterable[NDArray[np.uint8]]) -> NDArray[np.int64]:
-    """How often each of `OUTCOMES` stands in arrays of their codes."""
-    counts = np.zeros(len(OUTCOMES), dtype=np.int64)
+    """How often each of `OUTCOME_KINDS` stands in arrays of their codes."""
+    counts = np.zeros(len(OUTCOME_KINDS), dtype=np.int64)
     for codes in outcomes:
-        counts += np.bincount(codes, minlength=len(OUTCOMES))
+        counts += np.bincount(codes, minlength=len(OUTCOME_KINDS))
     return counts
 
 

@@ -14,7 +14,8 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simharness.play.records import FAILURE_KINDS, ROUND_ENDS, RoundRecord
+from simharness.play.records import ROUND_ENDS, RoundRecord
+from simharness.sim.outcomes import FAILURE_KINDS
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""

@@ -13,12 +13,12 @@ import numpy as np
 from jaxtyping import Float64
 
 from simharness.sim.camera import Preset
-from simharness.sim.execute import Executor, OutcomeKind
+from simharness.sim.execute import Executor
 from simharness.sim.objects import SceneKind
+from simharness.sim.outcomes import OutcomeKind
 
 RoundEnd = Literal["empty", "two_failures", "no_grasps"]
 
-FAILURE_KINDS: tuple[OutcomeKind, ...] = tuple(kind for kind in get_args(OutcomeKind) if kind != "success")
 ROUND_ENDS: tuple[RoundEnd, ...] = get_args(RoundEnd)
 
 OBJECTS_PER_ROUND = 5
@@ -123,7 +123,7 @@ class AttemptRecord:
         T_world_grasp: (4, 4) pose of the TCP.
         width: opening set before the approach, metres.
         score: probability of success that the model gave.
-        outcome: `success` or one of FAILURE_KINDS.
+        outcome: what became of it.
         grasped: names of the objects that were lifted.
         objects: names of the objects that were there before.
         contact_at_start, contact_on_way: whether the hand touched anything before closing.

@@ -20,9 +20,10 @@ from simharness.play.replay import replay
 from simharness.play.round import Attempted
 from simharness.report.report import aligned
 from simharness.sim.camera import INTRINSICS, Images, Observation
-from simharness.sim.execute import Grip, OutcomeKind
+from simharness.sim.execute import Grip
 from simharness.sim.hand import HandContact, HandPart
 from simharness.sim.objects import ObjectModel
+from simharness.sim.outcomes import OutcomeKind
 from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT
 from tesnet.geometry import Pose
 

@@ -13,27 +13,15 @@ from simharness.play.metrics import Rate, Summary, summarise
 from simharness.play.photographer import FAILURES, FIRST_ROUNDS, VIEWS, picture_name
 from simharness.play.records import AttemptRecord, Run
 from simharness.report.report import percent, times, title
+from simharness.sim.outcomes import OUTCOMES
 
-_OUTCOME_COLOURS = {
-    "success": "#16a34a",
-    "pregrasp": "#7c3aed",
-    "approach": "#d97706",
-    "slip": "#dc2626",
-    "drop": "#0284c7",
+_ENDS: Mapping[str, tuple[str, str]] = {
+    "empty": ("the table is empty", "#16a34a"),
+    "two_failures": ("attempts in a row failed", "#dc2626"),
+    "no_grasps": ("three looks in a row gave none", "#64748b"),
 }
-_END_COLOURS = {"empty": "#16a34a", "two_failures": "#dc2626", "no_grasps": "#64748b"}
-_END_MEANINGS = {
-    "empty": "the table is empty",
-    "two_failures": "attempts in a row failed",
-    "no_grasps": "three looks in a row gave none",
-}
-_OUTCOME_MEANINGS = {
-    "success": "lifted and held",
-    "pregrasp": "contact before the approach",
-    "approach": "contact on the way",
-    "slip": "nothing held after closing",
-    "drop": "lost while lifting",
-}
+"""What a round's end means, and its colour."""
+
 _VIEW_TITLES = {
     "colour": "Camera, colour",
     "segmentation": "Camera, segmentation",
@@ -136,15 +124,15 @@ def _interval(rate: Rate) -> str:
 
 
 def _shares(entries: Sequence[tuple[str, int, str, str]]) -> str:
-    """A bar divided in proportion to counts, and what its parts are: name, count, colour, meaning."""
+    """A bar divided in proportion to counts, and what its parts are: name, count, meaning, colour."""
     total = sum(count for _, count, _, _ in entries)
     pieces = "".join(
-        f'<i style="flex-grow:{count};background:{colour}"></i>' for _, count, colour, _ in entries if count
+        f'<i style="flex-grow:{count};background:{colour}"></i>' for _, count, _, colour in entries if count
     )
     rows = "".join(
         f'<tr{"" if count else " class=none"}><td><i style="background:{colour}"></i>{escape(_words(name))}</td>'
         f"<td>{count}</td><td>{_share(count, total)}</td><td>{escape(meaning)}</td></tr>"
-        for name, count, colour, meaning in entries
+        for name, count, meaning, colour in entries
     )
     return (
         f'<div class="stack" role="img" aria-label="shares">{pieces}</div>'
@@ -157,13 +145,13 @@ def _share(count: int, total: int) -> str:
 
 
 def _outcomes(summary: Summary) -> str:
-    outcomes = {"success": summary.gsr.count, **summary.failures}
-    entries = [(kind, count, _OUTCOME_COLOURS[kind], _OUTCOME_MEANINGS[kind]) for kind, count in outcomes.items()]
+    counts = {"success": summary.gsr.count, **summary.failures}
+    entries = [(kind, counts[kind], words.meaning, words.colour) for kind, words in OUTCOMES.items()]
     return f'<div class="card"><h3>Attempts by outcome</h3>{_shares(entries)}</div>'
 
 
 def _ends(summary: Summary) -> str:
-    entries = [(way, count, _END_COLOURS[way], _END_MEANINGS[way]) for way, count in summary.ended.items()]
+    entries = [(way, count, *_ENDS[way]) for way, count in summary.ended.items()]
     nothing = ", ".join(f"{escape(_words(reason))} {count}" for reason, count in summary.no_grasps.items()) or "none"
     return (
         f'<div class="card"><h3>Rounds by end</h3>{_shares(entries)}'
@@ -222,7 +210,7 @@ def _attempt(attempt: AttemptRecord, pictures: Path) -> str:
     )
     return (
         '<div class="attempt"><header>'
-        f'<span class="badge" style="background:{_OUTCOME_COLOURS[attempt.outcome]}">{escape(attempt.outcome)}</span>'
+        f'<span class="badge" style="background:{OUTCOMES[attempt.outcome].colour}">{escape(attempt.outcome)}</span>'
         f"<b>Round {attempt.round}, attempt {attempt.attempt}</b><span>score {attempt.score:.3f}</span>"
         f'<small>{escape(lifted)}</small></header><div class="views">{figures}</div></div>'
     )

@@ -19,11 +19,11 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from simharness.sim.hand import MAX_WIDTH, Hand, HandContact, Placement, placements
+from simharness.sim.outcomes import OutcomeKind
 from simharness.sim.scene import settle
 from simharness.sim.world import TIMESTEP, World
 from tesnet.geometry import Pose
 
-OutcomeKind = Literal["success", "pregrasp", "approach", "slip", "drop"]
 Executor = Literal["edge", "strict"]
 
 PREGRASP_DISTANCE = 0.05
@@ -78,8 +78,7 @@ class Outcome:
     """What became of an attempt, and the evidence, which is left out when outcomes are compared.
 
     Args:
-        kind: `success`, or how it failed: contact at the start pose, contact on the way, nothing held after closing,
-            lost during the retreat.
+        kind: `success`, or how it failed.
         grasped: ids of the objects that were lifted and removed.
         contact_at_start: the hand touched something where it appeared.
         contact_on_way: it touched something between there and the grasp.

@@ -6,9 +6,10 @@ from pathlib import Path
 
 import torch
 
+from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet import candidates
 from tests.tesnet.scenes import WORKSPACE, prepared, tabletop_query
-from training.views import OUTCOMES, LabelledView, pairs_of, save_scene
+from training.views import LabelledView, pairs_of, save_scene
 
 
 def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) -> LabelledView:
@@ -25,8 +26,8 @@ def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) 
     assert len(found) == count
     depth = (ready.points[found.contact] - ready.points[found.approach]).norm(dim=1)
     successes = depth.argsort()[: count // 3 if positives is None else positives]
-    outcomes = torch.full((count,), OUTCOMES.index("approach"), dtype=torch.uint8)
-    outcomes[successes] = OUTCOMES.index("success")
+    outcomes = torch.full((count,), OUTCOME_KINDS.index("approach"), dtype=torch.uint8)
+    outcomes[successes] = OUTCOME_KINDS.index("success")
     return LabelledView(
         cloud=ready,
         pairs=pairs_of(ready, found),

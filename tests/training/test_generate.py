@@ -7,8 +7,9 @@ from pathlib import Path
 import numpy as np
 import pytest
 
+from simharness.sim.outcomes import OUTCOME_KINDS
 from training.generate import GenerateConfig, generate
-from training.views import OUTCOMES, LabelsError, load_scene, scene_files
+from training.views import LabelsError, load_scene, scene_files
 
 pytestmark = pytest.mark.sim
 
@@ -33,7 +34,7 @@ def test_labels_come_with_all_that_is_needed_to_see_the_scene_again(labels: Path
     files = scene_files([labels])
     assert account["scenes"] == len(files)
     assert account["labels"] == sum(account["outcomes"].values()) >= 1
-    assert list(account["outcomes"]) == list(OUTCOMES)
+    assert list(account["outcomes"]) == list(OUTCOME_KINDS)
     total = 0
     for path in files:
         description, views = load_scene(path)
@@ -43,7 +44,7 @@ def test_labels_come_with_all_that_is_needed_to_see_the_scene_again(labels: Path
             total += len(view.outcomes)
             assert len(view.outcomes) <= 6
             assert view.scene == "packed"
-            assert view.outcomes.max() < len(OUTCOMES)
+            assert view.outcomes.max() < len(OUTCOME_KINDS)
             assert int((~view.collision_free).sum()) <= 3
     assert total == account["labels"]
 
