@@ -11,8 +11,6 @@ from __future__ import annotations
 import hashlib
 import json
 import math
-import os
-import uuid
 from collections.abc import Mapping, Sequence
 from dataclasses import dataclass, field
 from importlib import resources
@@ -25,6 +23,7 @@ from safetensors import SafetensorError
 from torch import Tensor
 
 from tesnet.errors import WeightsError
+from tesnet.whole_file import write_whole
 
 SUMS = "SHA256SUMS"
 """Name of the file that lists checksums of the files beside it, as `sha256sum` writes it."""
@@ -72,17 +71,9 @@ def save(path: Path, state_dict: Mapping[str, Tensor], header: Header) -> None:
     _check_finite(path, state_dict)
     tensors = {name: tensor.detach().cpu().contiguous().clone() for name, tensor in state_dict.items()}
     data = safetensors.torch.save(tensors, {_KEY: _to_json(path, header)})
-    temporary = path.with_name(f".{path.name}.{uuid.uuid4().hex}.tmp")
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        try:
-            with temporary.open("xb") as file:
-                file.write(data)
-                file.flush()
-                os.fsync(file.fileno())
-            temporary.replace(path)
-        finally:
-            temporary.unlink(missing_ok=True)
+        write_whole(path, data)
     except OSError as error:
         raise WeightsError(path, f"cannot be written: {error.strerror}; choose a writable place") from error
 

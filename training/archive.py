@@ -29,6 +29,7 @@ from tesnet import cloud
 from tesnet.candidates import grasp_poses
 from tesnet.cloud import nearest_neighbours
 from tesnet.geometry import Pose
+from tesnet.whole_file import whole_file
 from training.generate import is_free, observed_query
 from training.views import LabelledView, LabelsError, count_outcomes, load_scene, save_scene, scene_files
 
@@ -194,10 +195,8 @@ def _write_part(path: Path, scenes: Sequence[tuple[Mapping[str, Any], Sequence[A
     for name in ("approach_point", "contact_point", "closing_direction"):
         arrays[name] = np.ascontiguousarray(arrays[name].T)
     arrays["names"] = np.frombuffer(json.dumps(names).encode(), dtype=np.uint8)
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
+    with whole_file(path) as file:
         np.savez_compressed(file, allow_pickle=False, **arrays)
-    temporary.replace(path)
 
 
 def _to_grid(points: NDArray[np.float64]) -> NDArray[np.int64]:

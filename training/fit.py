@@ -20,6 +20,7 @@ from tqdm import tqdm
 from tesnet import networks, weights
 from tesnet.networks import Network
 from tesnet.predictor import configuration_of
+from tesnet.whole_file import write_whole
 from training import metrics
 from training.augment import augment
 from training.evaluate import measure, score_views
@@ -249,9 +250,7 @@ def _save_checkpoint(path: Path, network: Network, optimiser: torch.optim.Optimi
     tensors = {f"network.{name}": tensor for name, tensor in network.state_dict().items()}
     for number, state in optimiser.state_dict()["state"].items():
         tensors |= {f"optimiser.{number}.{name}": torch.as_tensor(value) for name, value in state.items()}
-    temporary = path.with_name(path.name + ".partial")
-    safetensors.torch.save_file(tensors, temporary, {"progress": json.dumps(asdict(progress))})
-    temporary.replace(path)
+    write_whole(path, safetensors.torch.save(tensors, {"progress": json.dumps(asdict(progress))}))
 
 
 def _resume(path: Path, network: Network, optimiser: torch.optim.Optimizer) -> _Progress | None:

@@ -37,6 +37,7 @@ from tesnet.geometry import PANDA
 from tesnet.networks import Network
 from tesnet.predictor import APPROACH_DISTANCE
 from tesnet.query import GraspQuery
+from tesnet.whole_file import write_whole
 from training.views import LabelledView, LabelsError, count_outcomes, pairs_of, save_scene, scene_files
 
 _HEAR_S = 1.0
@@ -114,7 +115,7 @@ def generate(
                 made |= {message.job: message.result for message in heard if isinstance(message, Done)}
             number = given.popleft()
             scene = made.pop(number)
-            _write(out / _file_name(number), scene.content)
+            write_whole(out / _file_name(number), scene.content)
             counts += scene.counts
             fresh += int(scene.counts.sum())
             busy_s += scene.seconds
@@ -194,13 +195,6 @@ class _Scenes:
                 return _Made(path.read_bytes(), counts, time.monotonic() - started)
 
         yield make
-
-
-def _write(path: Path, content: bytes) -> None:
-    """The whole file or, when the run is stopped meanwhile, none."""
-    draft = path.with_name(f".{path.name}.{os.getpid()}")
-    draft.write_bytes(content)
-    draft.replace(path)
 
 
 def _file_name(number: int) -> str:

@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 import json
-import os
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
 from dataclasses import dataclass
@@ -18,6 +17,7 @@ from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
 from tesnet.cloud import PreparationConfig, PreparedCloud, estimate_normals, orient_normals
 from tesnet.geometry import Pose
+from tesnet.whole_file import whole_file
 
 
 class LabelsError(Exception):
@@ -66,7 +66,7 @@ def count_outcomes(outcomes: Iterable[NDArray[np.uint8]]) -> NDArray[np.int64]:
 
 
 def save_scene(path: Path, description: Mapping[str, Any], views: Sequence[LabelledView]) -> None:
-    """Writes one scene atomically: the cloud as float16 (0.06 mm at 0.1 m), indices as uint16, outcomes as bytes."""
+    """Writes one scene, whole: the cloud as float16 (0.06 mm at 0.1 m), indices as uint16, outcomes as bytes."""
     arrays: dict[str, NDArray[Any]] = {
         "description": np.frombuffer(json.dumps(description).encode(), dtype=np.uint8),
         "counts": count_outcomes(view.outcomes.numpy() for view in views),
@@ -91,10 +91,8 @@ def save_scene(path: Path, description: Mapping[str, Any], views: Sequence[Label
             f"{number}/outcomes": view.outcomes.numpy().astype(np.uint8),
             f"{number}/collision_free": view.collision_free.numpy(),
         }
-    temporary = path.with_name(f".{path.name}.{os.getpid()}")
-    with temporary.open("wb") as file:
+    with whole_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
-    temporary.replace(path)
 
 
 def pairs_of(cloud: PreparedCloud, candidates: Candidates) -> torch.Tensor:

@@ -17,6 +17,7 @@ from typing import Any, TypeVar
 
 from simharness.errors import UsageError
 from simharness.play.records import AttemptRecord, ModelRecord, RoundRecord, RunSettings, Serving
+from tesnet.whole_file import write_whole
 
 T = TypeVar("T")
 
@@ -138,16 +139,16 @@ class RunFolder:
         """Replace both files by `rounds` in the order of seed, round and attempt."""
         ordered = sorted(rounds, key=lambda record: (record.seed, record.round))
         attempts = [attempt.to_json() for record in ordered for attempt in record.attempts]
-        _replace(self._file(ATTEMPTS_FILE), _lines(attempts))
-        _replace(self._file(ROUNDS_FILE), _lines(record.to_json() for record in ordered))
+        self.write_text(ATTEMPTS_FILE, _lines(attempts))
+        self.write_text(ROUNDS_FILE, _lines(record.to_json() for record in ordered))
 
     def write_json(self, name: str, values: Mapping[str, Any]) -> None:
         """Write one JSON file, whole or not at all."""
-        _replace(self._file(name), json.dumps(values, indent=1, allow_nan=False) + "\n")
+        self.write_text(name, json.dumps(values, indent=1, allow_nan=False) + "\n")
 
     def write_text(self, name: str, text: str) -> None:
         """Write one text file, whole or not at all."""
-        _replace(self._file(name), text)
+        write_whole(self._file(name), text.encode())
 
     @property
     def pictures(self) -> Path:
@@ -186,9 +187,3 @@ def _append(path: Path, values: Iterable[Mapping[str, Any]]) -> None:
         file.write(_lines(values))
         file.flush()
         os.fsync(file.fileno())
-
-
-def _replace(path: Path, text: str) -> None:
-    draft = path.with_suffix(path.suffix + ".part")
-    draft.write_text(text, encoding="utf-8")
-    draft.replace(path)

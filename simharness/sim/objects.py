@@ -18,7 +18,6 @@ from __future__ import annotations
 import hashlib
 import importlib.util
 import os
-import tempfile
 import xml.etree.ElementTree as ET
 from collections.abc import Iterable, Sequence
 from dataclasses import dataclass
@@ -32,6 +31,7 @@ import numpy.typing as npt
 
 from simharness.errors import ObjectSetError
 from simharness.sim import procedural
+from tesnet.whole_file import write_whole
 
 SceneKind = Literal["packed", "pile"]
 Array = npt.NDArray[np.float64]
@@ -158,23 +158,15 @@ def read_names(path: Path) -> list[tuple[int, str]]:
     return [(number, line) for number, line in lines if line]
 
 
-def write_atomically(path: Path, data: bytes) -> None:
-    """Write a file so that other processes see all of it or nothing.
+def _write_to_cache(path: Path, data: bytes) -> None:
+    """Write a file, and its folder where there is none.
 
     Raises:
         ObjectSetError: the folder cannot be written to.
     """
     try:
         path.parent.mkdir(parents=True, exist_ok=True)
-        descriptor, temporary = tempfile.mkstemp(dir=path.parent, prefix=f".{path.name}.")
-        try:
-            with os.fdopen(descriptor, "wb") as file:
-                file.write(data)
-            Path(temporary).chmod(0o644)
-            Path(temporary).replace(path)
-        except BaseException:
-            Path(temporary).unlink(missing_ok=True)
-            raise
+        write_whole(path, data)
     except OSError as error:
         raise ObjectSetError(
             f"cache folder {path.parent}: {error.strerror}",
@@ -244,7 +236,7 @@ def _procedural(split: procedural.Split, cache: Path) -> list[_Source]:
         urdf = folder / "object.urdf"
         if not urdf.is_file() or not all(mesh.is_file() for mesh in _meshes(urdf)):
             for file_name, data in procedural.generate_object(name).files().items():  # the URDF comes last
-                write_atomically(folder / file_name, data)
+                _write_to_cache(folder / file_name, data)
         sources.append(_Source(name, urdf))
     return sources
 
@@ -394,10 +386,10 @@ def _wrap_mesh(source: _Source, cache: Path) -> Path:
     if path.suffix.lower() != ".obj":  # the simulator reads no PLY, and of STL the binary kind only
         path = folder / "object.obj"
         if not urdf.is_file():
-            write_atomically(path, _as_obj(source.path))
+            _write_to_cache(path, _as_obj(source.path))
     if not urdf.is_file():
         offset = " ".join(f"{-(low + high) / 2:.9g}" for low, high in zip(mesh.minimum, mesh.maximum, strict=True))
-        write_atomically(urdf, _wrapper(PurePosixPath(source.name).name, path, offset).encode())
+        _write_to_cache(urdf, _wrapper(PurePosixPath(source.name).name, path, offset).encode())
     return urdf
 
 

@@ -148,7 +148,7 @@ def test_a_failed_save_leaves_the_old_file_and_no_other(path: Path, monkeypatch:
         raise OSError(28, "No space left on device")
 
     before = path.read_bytes()
-    monkeypatch.setattr("tesnet.weights.os.fsync", full)
+    monkeypatch.setattr("tesnet.whole_file.os.fsync", full)
     with pytest.raises(WeightsError, match="cannot be written: No space left on device"):
         weights.save(path, {"other": torch.zeros(3)}, HEADER)
     assert path.read_bytes() == before
