@@ -24,7 +24,7 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
     of the workspace are withheld in some views, since a caller may not know them.
     """
     cloud = view.cloud
-    rotation = random_rotation(rng)
+    rotation = Pose.random(rng).rotation
     turn = torch.tensor(rotation, dtype=torch.float32)
     centre = cloud.points.mean(dim=0)
     height = cloud.support_height
@@ -47,8 +47,3 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
     )
     shift = torch.stack([centre, centre, torch.zeros(3), torch.zeros(3)])  # two points and two directions
     return replace(view, cloud=turned, pairs=(view.pairs - shift) @ turn.T)
-
-
-def random_rotation(rng: np.random.Generator) -> np.ndarray[tuple[int, int], np.dtype[np.float64]]:
-    """A rotation matrix drawn uniformly: the unit quaternion of four normal variates."""
-    return np.array(Pose.from_quaternion(rng.normal(size=4), np.zeros(3)).rotation)

@@ -206,10 +206,11 @@ def _drop_objects(
     loaded: _Loaded = []
     for _ in range(num_objects):
         model = objects[int(rng.integers(len(objects)))]
-        quaternion_xyzw = rng.standard_normal(4)
+        turned = Pose.random(rng)
         x, y = rng.uniform(*_PILE_RANGE, size=2)
         scale = float(rng.uniform(*scale_range)) * model.scale_hint
-        body = _load(world, model, Pose.from_quaternion(quaternion_xyzw, [x, y, TABLE_HEIGHT + _PILE_DROP]), scale)
+        above = np.array([x, y, TABLE_HEIGHT + _PILE_DROP])
+        body = _load(world, model, Pose(turned.rotation, above), scale)
         loaded.append((body, model, scale))
         _wait(world, _PILE_SETTLING_LIMIT)
     for wall in walls:

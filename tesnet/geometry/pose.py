@@ -99,6 +99,16 @@ class Pose:
         right = unit(np.cross(forward, unit(up)))
         return cls(np.stack([right, np.cross(forward, right), forward], axis=1), np.asarray(eye, dtype=np.float64))
 
+    @classmethod
+    def random(cls, rng: np.random.Generator, reach: float = 0.0) -> Pose:
+        """A rotation drawn uniformly and a translation of up to `reach` metres either way along each axis.
+
+        Four normal variates point in every direction alike, hence so does their unit quaternion (Muller 1959). No
+        translation is drawn for a reach of 0.
+        """
+        quaternion_xyzw = rng.standard_normal(4)
+        return cls.from_quaternion(quaternion_xyzw, rng.uniform(-reach, reach, 3) if reach else np.zeros(3))
+
     # Accessors
 
     @property

@@ -195,7 +195,7 @@ def document(size: int) -> dict[str, Any]:
     rng = np.random.default_rng(size)
     grasps = []
     for rank in range(size):
-        pose = Pose.from_quaternion(rng.normal(size=4), rng.uniform(-0.3, 0.3, 3))
+        pose = Pose.random(rng, reach=0.3)
         hand = pose @ Pose(np.eye(3), np.array([0.0, 0.0, -0.1034]))
         pregrasp = pose @ Pose(np.eye(3), np.array([0.0, 0.0, -0.05]))
         outs = [

@@ -107,11 +107,6 @@ def moved_query(query: GraspQuery, motion: Pose) -> GraspQuery:
     return ask(motion.apply(query.points), **options)
 
 
-def random_motion(rng: np.random.Generator, reach: float = 0.5) -> Pose:
-    """A rotation drawn uniformly and a translation of up to `reach` metres along each axis."""
-    return Pose.from_quaternion(rng.normal(size=4), rng.uniform(-reach, reach, 3))
-
-
 def prepared(query: GraspQuery, **changes: Any) -> cloud.PreparedCloud:
     """The prepared cloud of a query that has one."""
     found = cloud.prepare(query, cloud.PreparationConfig(**changes), CPU)

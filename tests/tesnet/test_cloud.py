@@ -25,7 +25,6 @@ from tests.tesnet.scenes import (
     box_surface,
     moved_query,
     prepared,
-    random_motion,
     tabletop,
     tabletop_query,
 )
@@ -230,7 +229,7 @@ def test_with_one_viewpoint_every_normal_faces_it() -> None:
 def test_the_canonical_frame_moves_with_the_cloud(seed: int, with_up: bool) -> None:
     rng = np.random.default_rng(seed)
     query = tabletop_query(seed % 3) if with_up else ask(tabletop(seed % 3), viewpoints=CAMERA)
-    moved = moved_query(query, random_motion(rng))
+    moved = moved_query(query, Pose.random(rng, reach=0.5))
     first, second = prepared(query), prepared(moved)
     # float32 coordinates of the moved query are exact to 6e-8 m or so; a point in a few thousand changes its cell.
     assert abs(len(first) - len(second)) <= 3

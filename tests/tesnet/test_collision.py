@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tesnet import candidates, collision
 from tesnet.geometry import PANDA, Pose
-from tests.tesnet.scenes import Array, bare_cloud, prepared, random_motion, tabletop_query
+from tests.tesnet.scenes import Array, bare_cloud, prepared, tabletop_query
 
 ROUNDING = 1e-6
 SWEEP = 0.05
@@ -58,7 +58,7 @@ def hits(points: Array, Ts: Array, width: float, sweep: float = SWEEP) -> Array:
 def test_collision_is_that_of_a_brute_force_twin(seed: int, count: int, width: float, sweep: float) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.12, 0.12, (count, 3)).astype(np.float32).astype(np.float64)
-    Ts = np.array([random_motion(rng, reach=0.08).matrix for _ in range(20)])
+    Ts = np.array([Pose.random(rng, reach=0.08).matrix for _ in range(20)])
     depth, found = penetration(points, Ts, width, sweep), hits(points, Ts, width, sweep)
     assert_agree(found, depth)
     if not sweep:  # one step is the whole way
@@ -103,7 +103,7 @@ def test_a_point_is_hit_where_the_hand_passes(place: list[float], expected: bool
 def test_a_hand_turned_by_half_a_turn_collides_equally(seed: int) -> None:
     rng = np.random.default_rng(seed)
     points = rng.uniform(-0.1, 0.1, (8, 3))
-    Ts = np.array([random_motion(rng, reach=0.08).matrix for _ in range(40)])
+    Ts = np.array([Pose.random(rng, reach=0.08).matrix for _ in range(40)])
     turned = Ts @ Pose(np.diag([-1.0, -1.0, 1.0]), np.zeros(3)).matrix
     np.testing.assert_array_equal(hits(points, Ts, 0.08), hits(points, turned, 0.08))
 
@@ -115,7 +115,7 @@ def test_no_candidates_have_no_collisions() -> None:
 def test_points_are_expressed_in_every_grasps_frame() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-0.2, 0.2, (20, 3))
-    motions = [random_motion(rng) for _ in range(6)]
+    motions = [Pose.random(rng, reach=0.5) for _ in range(6)]
     Ts = torch.from_numpy(np.array([motion.matrix for motion in motions]))
     found = torch.stack(collision.points_in_grasp_frames(torch.from_numpy(points), Ts), dim=2)
     expected = np.array([motion.inverse().apply(points) for motion in motions])
@@ -163,7 +163,7 @@ def test_a_second_viewpoint_that_sees_the_place_lifts_the_shadow() -> None:
 
 @pytest.mark.parametrize("turn", range(3))
 def test_the_shadow_moves_with_the_scene(turn: int) -> None:
-    motion = random_motion(np.random.default_rng(turn))
+    motion = Pose.random(np.random.default_rng(turn), reach=0.5)
     Ts = np.tile(HAND_ALONG_X, (3, 1, 1))
     Ts[:, :3, 3] = [[0.0, 0.0, -0.1], [0.0, 0.0, 0.1], [0.5, 0.0, -0.1]]
     moved = torch.from_numpy(motion.matrix @ Ts).float()

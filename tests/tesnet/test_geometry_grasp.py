@@ -8,12 +8,11 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tesnet.geometry import FRAME_CONVENTIONS, GraspSet, Pose
-from tests.tesnet.scenes import random_motion
 
 
 def grasp_set(count: int, seed: int = 0) -> GraspSet:
     rng = np.random.default_rng(seed)
-    Ts = np.array([random_motion(rng).matrix for _ in range(count)]).reshape(count, 4, 4)
+    Ts = np.array([Pose.random(rng, reach=0.5).matrix for _ in range(count)]).reshape(count, 4, 4)
     return GraspSet(
         rng.random(count), Ts, np.full(count, 0.08), rng.normal(size=(count, 3)), rng.normal(size=(count, 3))
     )

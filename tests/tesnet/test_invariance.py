@@ -23,7 +23,6 @@ from tests.tesnet.scenes import (
     moved_cloud,
     moved_query,
     prepared,
-    random_motion,
     tabletop,
     tabletop_query,
 )
@@ -52,7 +51,7 @@ def network(which: str) -> Network:
 def test_for_a_prepared_cloud_scores_are_invariant_and_grasps_equivariant(
     which: str, seed: int, scene: int, with_up: bool
 ) -> None:
-    motion = random_motion(np.random.default_rng(seed))
+    motion = Pose.random(np.random.default_rng(seed), reach=0.5)
     query = tabletop_query(scene) if with_up else ask(tabletop(scene), viewpoints=CAMERA)
     query = replace(query, max_candidates=20_000)  # none is left to chance
     still = prepared(query)
@@ -85,7 +84,7 @@ def test_end_to_end_the_top_score_hardly_moves_with_the_scene() -> None:
         query = tabletop_query(scene)
         still = predictor("shipped").predict(query).grasps
         for _ in range(3):
-            motion = random_motion(rng)
+            motion = Pose.random(rng, reach=0.5)
             moved = predictor("shipped").predict(moved_query(query, motion)).grasps
             changes.append(abs(float(still.scores[0] - moved.scores[0])))
             back = motion.inverse().apply(moved.Ts_cloud_grasp[0, :3, 3])

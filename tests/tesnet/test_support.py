@@ -11,7 +11,7 @@ from numpy.typing import NDArray
 from tesnet import support
 from tesnet.geometry import Pose
 from tesnet.query import Box, GraspQuery
-from tests.tesnet.scenes import CAMERA, CPU, UP, ask, fresh_predictor, random_motion, tabletop
+from tests.tesnet.scenes import CAMERA, CPU, UP, ask, fresh_predictor, tabletop
 
 Array = NDArray[np.float64]
 
@@ -31,7 +31,7 @@ def test_the_table_under_objects_is_found_to_a_millimetre_wherever_the_frame_lie
     rng = np.random.default_rng(seed)
     points = np.concatenate([tabletop(seed), table()])
     points += rng.normal(0, noise, points.shape)
-    motion = random_motion(rng) if seed else Pose.identity()
+    motion = Pose.random(rng, reach=0.5) if seed else Pose.identity()
     found = support.dominant_plane(auto(motion.apply(points), up=motion.rotate(UP)), CPU)
     assert found is not None
     expected = float(motion.translation @ motion.rotate(UP))

@@ -7,7 +7,7 @@ from tesnet.networks import encode
 from tesnet.visibility import outside
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view
-from training.augment import augment, random_rotation
+from training.augment import augment
 from training.views import LabelledView
 
 VIEW = labelled_view()
@@ -70,11 +70,3 @@ def test_augmentation_repeats_for_a_seed_and_leaves_the_view_alone() -> None:
     assert not torch.equal(turned(3).cloud.points, turned(4).cloud.points)
     assert torch.equal(VIEW.cloud.points, before)
     assert torch.equal(turned(3).outcomes, VIEW.outcomes)
-
-
-def test_rotations_are_uniform() -> None:
-    """The mean of uniform rotations is zero, and every axis lands in every octant."""
-    rng = np.random.default_rng(0)
-    rotations = np.array([random_rotation(rng) for _ in range(4000)])
-    np.testing.assert_allclose(rotations.mean(axis=0), 0, atol=0.04)
-    np.testing.assert_allclose((rotations**2).mean(axis=0), 1 / 3, atol=0.02)
