@@ -10,48 +10,43 @@ what was done is kept; 130 and 143 stopped by Ctrl-C and by SIGTERM.
 from __future__ import annotations
 
 import argparse
-import os
 import signal
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
-from datetime import datetime, timezone
 from pathlib import Path
 from types import FrameType
-from typing import TYPE_CHECKING, Any, get_args
+from typing import TYPE_CHECKING, Any
 
 from tqdm import tqdm
 
-from simharness.errors import RunBroken, SimError, UsageError
+from simharness.errors import RunBroken, SimError
+from simharness.options import (
+    failures_parser,
+    out_of,
+    replay_parser,
+    robustness_parser,
+    run_parser,
+    settings_of,
+)
 from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
-from simharness.play.metrics import summarise
 from simharness.play.photographer import attempts_to_show, keep_only, take_pictures
-from simharness.play.records import RoundRecord, Run, RunSettings
+from simharness.play.records import Run
 from simharness.play.replay import find_attempt, replay
 from simharness.play.run import Hooks, run
+from simharness.play.settings import RunSettings
 from simharness.report.causes import failures, failures_report, failures_table
 from simharness.report.page import page
-from simharness.report.report import package_versions, percent, report, table
-from simharness.report.robustness import AXIS_NAMES, JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
-from simharness.sim.camera import PRESETS
-from simharness.sim.execute import Executor
-from simharness.sim.objects import ObjectModel, SceneKind, load_object_set
+from simharness.report.progress import Progress
+from simharness.report.report import package_versions, report, table
+from simharness.report.robustness import JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
+from simharness.sim.objects import ObjectModel, load_object_set
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
 EXIT_USAGE = 2
 EXIT_BROKEN = 3
-
-_EXIT_CODES = (
-    "Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker failed, and "
-    "what was done is kept for --resume."
-)
-
-DEFAULT_OBJECTS: dict[SceneKind, str] = {"packed": "procedural", "pile": "pybullet-random"}
-DEFAULT_WORKERS = min(2, os.cpu_count() or 1)
-MAX_GRASPS_WATCHED = 10
-MAX_PORT = 65535
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -61,7 +56,7 @@ def main(arguments: Sequence[str] | None = None) -> int:
         for name, parser, carry_out in _COMMANDS:
             if given[:1] == [name]:
                 return carry_out(parser().parse_args(given[1:]))
-        return _run(_run_parser().parse_args(given))
+        return _run(run_parser().parse_args(given))
     except RunBroken as error:
         return _fail(error, EXIT_BROKEN)
     except SimError as error:
@@ -76,14 +71,14 @@ def _fail(error: SimError, code: int) -> int:
 
 
 def _run(options: argparse.Namespace) -> int:
-    settings = _settings(options)
-    _, code = _clear(options, settings, RunFolder(options.out or _default_out(settings)))
+    settings = settings_of(options)
+    _, code = _clear(options, settings, RunFolder(out_of(options, settings)))
     return code
 
 
 def _robustness(options: argparse.Namespace) -> int:
-    settings = _settings(options)
-    folder = RunFolder(options.out or _default_out(settings, "robustness-"))
+    settings = settings_of(options)
+    folder = RunFolder(out_of(options, settings, "robustness-"))
     study = Study(settings, options.against)
     code = 0
     for condition in conditions(options.against):
@@ -104,7 +99,7 @@ def _clear(options: argparse.Namespace, settings: RunSettings, folder: RunFolder
     objects = _objects(settings)
     signals = _Signals()
     with ExitStack() as stack:
-        progress = _Progress(settings)
+        progress = Progress(settings)
         stack.callback(progress.close)
         stack.enter_context(signals)
         event = None
@@ -188,286 +183,19 @@ def _failures(options: argparse.Namespace) -> int:
     return 0
 
 
-def _run_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m simharness",
-        description="Clear simulated tables through the grasp service and report success rates. Other commands: "
-        "`replay DIR --attempt K` shows one attempt again, `failures DIR` sorts failed attempts by cause, `robustness` "
-        "repeats a run under worse sensing; each has --help.",
-        epilog=_EXIT_CODES,
-        allow_abbrev=False,
-    )
-    _add_run_options(parser)
-    _add_camera_options(parser)
-    add = parser.add_argument
-    add("--watch", action="store_true", help="show the run live in a browser page; plays with one worker")
-    add(
-        "--watch-port",
-        type=_port,
-        default=8080,
-        metavar="PORT",
-        help="port of that page; the next free one is taken (default %(default)s)",
-    )
-    return parser
-
-
-def _robustness_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m simharness robustness",
-        description="Play the same rounds, seen by camera `random`, under noise, from other viewpoints and with fewer "
-        f"points; leaves a run for each condition and {TABLE_FILE}, {PLOT_FILE} and {JSON_FILE}.",
-        epilog=_EXIT_CODES,
-        allow_abbrev=False,
-    )
-    _add_run_options(parser)
-    unchanged = {"camera": "random", "watch": False}
-    changed = dict.fromkeys(("noise_std", "depth_noise_std", "dex_noise", "polar_deg", "voxel_size"))
-    parser.set_defaults(**unchanged, **changed)
-    parser.add_argument(
-        "--against",
-        nargs="+",
-        choices=AXIS_NAMES,
-        default=AXIS_NAMES,
-        help="what is made worse (default: everything)",
-    )
-    return parser
-
-
-def _add_run_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add("--rounds", type=_at_least(1), default=100, metavar="N", help="rounds for each seed (default %(default)s)")
-    add(
-        "--scene",
-        choices=get_args(SceneKind),
-        default="packed",
-        help="packed: objects stand apart; pile: objects are poured (default %(default)s)",
-    )
-    add(
-        "--objects",
-        metavar="NAME_OR_PATH",
-        help="procedural, pybullet-random, a folder of URDF/OBJ files or a .txt list of them "
-        "(default: procedural for packed, pybullet-random for pile scenes)",
-    )
-    add("--exclude", metavar="LIST", help="file with names of objects to leave out")
-    add("--only", metavar="LIST", help="file with names of objects to use alone")
-    add(
-        "--executor",
-        choices=get_args(Executor),
-        default="edge",
-        help="edge: contacts on the way push, as in published harnesses; strict: a contact before closing is a "
-        "failure, and both fingers must hold the same object (default %(default)s)",
-    )
-    seeds = parser.add_mutually_exclusive_group()
-    seeds.add_argument("--seed", type=_at_least(0), metavar="SEED", help="run seed (default 0)")
-    seeds.add_argument("--seeds", type=_at_least(0), nargs="+", metavar="SEED", help="several run seeds, pooled")
-    add(
-        "--workers",
-        type=_at_least(1),
-        default=DEFAULT_WORKERS,
-        metavar="N",
-        help="processes that play rounds; results do not depend on it (default %(default)s)",
-    )
-    add("--model", default="tesnet", metavar="NAME", help="network to ask for (default %(default)s)")
-    add("--url", help="a running service (default: one is started for the run)")
-    add(
-        "--ray",
-        metavar="ADDRESS",
-        help="play the rounds on this Ray cluster; without --url every worker there has a service of its own",
-    )
-    add("--out", type=Path, metavar="DIR", help="where the reports go (default: a new folder in runs/)")
-    add("--resume", action="store_true", help="continue the run in --out")
-
-
-def _add_camera_options(parser: argparse.ArgumentParser) -> None:
-    add = parser.add_argument
-    add(
-        "--camera",
-        choices=PRESETS,
-        default="random",
-        help="random: one view from somewhere above; giga: one fixed view from the side; multi3: three views; "
-        "vgn6: six views (default %(default)s)",
-    )
-    add(
-        "--noise-std",
-        type=_not_negative,
-        metavar="M",
-        help="noise on each coordinate of each point, metres (default: the camera's)",
-    )
-    add("--depth-noise-std", type=_not_negative, metavar="M", help="noise on depth, metres (default: the camera's)")
-    add(
-        "--dex-noise",
-        action=argparse.BooleanOptionalAction,
-        help="the depth noise that camera giga has (default: the camera's)",
-    )
-    add(
-        "--polar-deg",
-        type=_between(0, 90, "degrees"),
-        metavar="DEG",
-        help="angle of the views from straight above (default: the camera's)",
-    )
-    add(
-        "--voxel-size",
-        type=_between(0, 1, "metres"),
-        metavar="M",
-        help="thin the cloud to one point for each voxel of this edge, metres (default: every point is sent)",
-    )
-
-
-def _replay_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m simharness replay", description="Render one attempt of a run again."
-    )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="the --out of a run")
-    parser.add_argument(
-        "--attempt",
-        type=_at_least(0),
-        required=True,
-        metavar="K",
-        help="which attempt: line of attempts.jsonl, the first is 0",
-    )
-    return parser
-
-
-def _failures_parser() -> argparse.ArgumentParser:
-    parser = argparse.ArgumentParser(
-        prog="python -m simharness failures",
-        description=f"Replay failed attempts of a run and sort them by cause; leaves {FAILURES_FILE} in its folder.",
-    )
-    parser.add_argument("folder", type=Path, metavar="DIR", help="the --out of a run")
-    parser.add_argument(
-        "--limit", type=_at_least(1), default=50, metavar="N", help="so many, the earliest (default %(default)s)"
-    )
-    return parser
-
-
 _COMMANDS = (
-    ("replay", _replay_parser, _replay),
-    ("failures", _failures_parser, _failures),
-    ("robustness", _robustness_parser, _robustness),
+    ("replay", replay_parser, _replay),
+    ("failures", failures_parser, _failures),
+    ("robustness", robustness_parser, _robustness),
 )
-
-
-def _settings(options: argparse.Namespace) -> RunSettings:
-    seeds = tuple(options.seeds or [options.seed or 0])
-    if len(set(seeds)) < len(seeds):
-        raise UsageError(f"--seeds {' '.join(map(str, seeds))}: a seed is named twice; name each once")
-    if options.watch and options.ray is not None:
-        raise UsageError("--watch shows a worker of this machine; leave out --ray, or --watch")
-    if options.resume and options.out is None:
-        raise UsageError("--resume needs --out: the folder of the run to continue")
-    return RunSettings(
-        rounds=options.rounds,
-        seeds=seeds,
-        scene=options.scene,
-        objects=_absolute(options.objects or DEFAULT_OBJECTS[options.scene]),
-        exclude=_absolute(options.exclude),
-        only=_absolute(options.only),
-        camera=options.camera,
-        noise_std=options.noise_std,
-        depth_noise_std=options.depth_noise_std,
-        executor=options.executor,
-        model=options.model,
-        max_grasps=MAX_GRASPS_WATCHED if options.watch else 1,
-        dex_noise=options.dex_noise,
-        polar_deg=options.polar_deg,
-        voxel_size=options.voxel_size,
-    )
 
 
 def _objects(settings: RunSettings) -> tuple[ObjectModel, ...]:
     return load_object_set(settings.objects, settings.scene, _path(settings.exclude), _path(settings.only))
 
 
-def _absolute(name: str | None) -> Any:
-    """A path that exists as an absolute one, so that a run is found again from anywhere; other names as they are."""
-    return str(Path(name).resolve()) if name is not None and Path(name).exists() else name
-
-
 def _path(name: str | None) -> Path | None:
     return None if name is None else Path(name)
-
-
-def _default_out(settings: RunSettings, prefix: str = "") -> Path:
-    now = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
-    return Path("runs") / f"{prefix}{settings.scene}-{settings.executor}-{now}"
-
-
-def _at_least(minimum: int) -> Any:
-    def parse(text: str) -> int:
-        try:
-            value = int(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is no whole number") from None
-        if value < minimum:
-            raise argparse.ArgumentTypeError(f"{value} is too small; give {minimum} or more")
-        return value
-
-    return parse
-
-
-def _port(text: str) -> int:
-    port: int = _at_least(0)(text)
-    if port > MAX_PORT:
-        raise argparse.ArgumentTypeError(f"{port} is no port; give 0 to {MAX_PORT}")
-    return port
-
-
-def _not_negative(text: str) -> float:
-    try:
-        value = float(text)
-    except ValueError:
-        raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
-    if not 0 <= value < 1:
-        raise argparse.ArgumentTypeError(f"{text} is out of range; give metres, 0 or more and less than 1")
-    return value
-
-
-def _between(low: float, high: float, unit: str) -> Any:
-    def parse(text: str) -> float:
-        try:
-            value = float(text)
-        except ValueError:
-            raise argparse.ArgumentTypeError(f"{text!r} is no number") from None
-        if not low < value < high:
-            raise argparse.ArgumentTypeError(
-                f"{text} is out of range; give {unit}, more than {low:g} and less than {high:g}"
-            )
-        return value
-
-    return parse
-
-
-class _Progress:
-    """A bar on stderr with the rates so far."""
-
-    def __init__(self, settings: RunSettings) -> None:
-        self._total = settings.rounds * len(settings.seeds)
-        self._rounds: list[RoundRecord] = []
-        self._bar: Any = None
-        self._others: list[Any] = []
-
-    def also(self, show: Any) -> None:
-        self._others.append(show)
-
-    def start(self, done: Sequence[RoundRecord]) -> None:
-        self._rounds = list(done)
-        self._bar = tqdm(total=self._total, initial=len(done), unit="round", file=sys.stderr, dynamic_ncols=True)
-        self._show()
-
-    def add(self, record: RoundRecord) -> None:
-        self._rounds.append(record)
-        self._bar.update()
-        self._show()
-
-    def close(self) -> None:
-        if self._bar is not None:
-            self._bar.close()
-
-    def _show(self) -> None:
-        summary = summarise(self._rounds)
-        self._bar.set_postfix_str(f"GSR {percent(summary.gsr)}, DR {percent(summary.dr)}")
-        for show in self._others:
-            show(summary)
 
 
 class _Signals:

@@ -16,7 +16,8 @@ from pathlib import Path
 from typing import Any, TypeVar
 
 from simharness.errors import UsageError
-from simharness.play.records import AttemptRecord, ModelRecord, RoundRecord, RunSettings, Serving
+from simharness.play.records import AttemptRecord, ModelRecord, RoundRecord, Serving
+from simharness.play.settings import RunSettings
 from tesnet.whole_file import write_whole
 
 T = TypeVar("T")

@@ -19,8 +19,9 @@ from simharness.play.pictures import (
     segmentation_colours,
     widen,
 )
-from simharness.play.records import AttemptRecord, RoundRecord, RunSettings
+from simharness.play.records import AttemptRecord, RoundRecord
 from simharness.play.round import Attempted, Observed
+from simharness.play.settings import RunSettings
 from simharness.sim.camera import INTRINSICS
 from tesnet.geometry import Pose
 

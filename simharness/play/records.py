@@ -1,4 +1,4 @@
-"""What a run is asked to do and what it writes down: frozen values and their JSON forms.
+"""What a run writes down: frozen values and their JSON forms.
 
 It knows neither how rounds are played nor where they are written.
 """
@@ -12,9 +12,7 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float64
 
-from simharness.sim.camera import Preset
-from simharness.sim.execute import Executor
-from simharness.sim.objects import SceneKind
+from simharness.play.settings import RunSettings
 from simharness.sim.outcomes import OutcomeKind
 
 RoundEnd = Literal["empty", "two_failures", "no_grasps"]
@@ -27,57 +25,6 @@ NO_GRASPS_IN_A_ROW = 3
 
 TIMING_KEYS = ("latency_ms",)
 """Keys of the JSON forms that hold measured times; everything else repeats bit for bit."""
-
-
-@dataclass(frozen=True, slots=True)
-class RunSettings:
-    """Everything that decides a run's results, apart from the model behind the service.
-
-    Args:
-        rounds: rounds for each seed.
-        seeds: run seeds; the results of several are pooled.
-        scene: how objects are placed.
-        objects: name or path of an object set.
-        exclude, only: lists of object names to leave out or to keep, or None.
-        camera: name of a camera preset.
-        noise_std, depth_noise_std: standard deviations of the noise on each coordinate of each point and on depth,
-            metres; None is the preset's own.
-        executor: how a grasp is carried out and judged.
-        model: network that the service is asked for.
-        max_grasps: grasps requested for each observation; the first is executed.
-        dex_noise: whether depth has the noise of Dex-Net 2.0; None is the preset's own.
-        polar_deg: angle of every view from straight above; None is the preset's own.
-        voxel_size: edge of the voxels that keep one point each, metres; None keeps every point.
-    """
-
-    rounds: int
-    seeds: tuple[int, ...]
-    scene: SceneKind
-    objects: str
-    exclude: str | None
-    only: str | None
-    camera: Preset
-    noise_std: float | None
-    depth_noise_std: float | None
-    executor: Executor
-    model: str
-    max_grasps: int
-    dex_noise: bool | None = None
-    polar_deg: float | None = None
-    voxel_size: float | None = None
-
-    def to_json(self) -> dict[str, Any]:
-        """The settings as JSON values."""
-        return {**asdict(self), "seeds": list(self.seeds)}
-
-    @classmethod
-    def from_json(cls, values: Mapping[str, Any]) -> RunSettings:
-        """Settings from `to_json`; runs recorded before an option existed were played without it.
-
-        Raises:
-            TypeError: a field without a default is missing, or one is unknown.
-        """
-        return cls(**{**values, "seeds": tuple(values["seeds"])})
 
 
 @dataclass(frozen=True, slots=True)

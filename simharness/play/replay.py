@@ -8,8 +8,9 @@ from typing import Any
 import numpy as np
 
 from simharness.errors import UsageError
-from simharness.play.records import AttemptRecord, RoundRecord, RunSettings
+from simharness.play.records import AttemptRecord, RoundRecord
 from simharness.play.round import Attempted, Observed, Plan, play_round
+from simharness.play.settings import RunSettings
 from simharness.sim.camera import Observation
 from simharness.sim.objects import ObjectModel
 

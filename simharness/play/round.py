@@ -22,8 +22,8 @@ from simharness.play.records import (
     NoGraspRecord,
     RoundEnd,
     RoundRecord,
-    RunSettings,
 )
+from simharness.play.settings import RunSettings
 from simharness.sim.camera import PRESET_NOISE, Noise, Observation, observe
 from simharness.sim.execute import Outcome, attempt
 from simharness.sim.hand import Hand

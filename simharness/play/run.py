@@ -18,9 +18,10 @@ from simharness.play.crew import Crew, Done, Emit, Event, Work, crew
 from simharness.play.folder import SERVICE_LOG, RunFolder
 from simharness.play.photographer import Photographer, Picture
 from simharness.play.planner import HttpPlanner
-from simharness.play.records import ModelRecord, RoundRecord, Run, RunSettings, Serving
+from simharness.play.records import ModelRecord, RoundRecord, Run, Serving
 from simharness.play.round import Attempted, Observed, play_round
 from simharness.play.server import NUM_THREADS, LocalService
+from simharness.play.settings import RunSettings
 from simharness.sim.objects import ObjectModel
 
 _LOOK_AFTER_SERVICE_S = 1.0

@@ -15,9 +15,10 @@ from typing import Any, Literal
 import numpy as np
 from jaxtyping import Float64
 
-from simharness.play.records import RoundRecord, RunSettings
+from simharness.play.records import RoundRecord
 from simharness.play.replay import replay
 from simharness.play.round import Attempted
+from simharness.play.settings import RunSettings
 from simharness.report.report import aligned
 from simharness.sim.camera import INTRINSICS, Images, Observation
 from simharness.sim.execute import Grip

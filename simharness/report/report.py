@@ -9,7 +9,8 @@ from importlib import metadata
 from typing import Any
 
 from simharness.play.metrics import Percentiles, Rate, Summary, summarise
-from simharness.play.records import OBJECTS_PER_ROUND, ModelRecord, Run, RunSettings
+from simharness.play.records import OBJECTS_PER_ROUND, ModelRecord, Run
+from simharness.play.settings import RunSettings
 
 _PACKAGES = ("tes-net", "numpy", "pybullet", "scipy", "trimesh", "pillow", "httpx", "torch")
 

@@ -13,7 +13,8 @@ from typing import Any, Literal, get_args
 
 from simharness.errors import UsageError
 from simharness.play.metrics import Rate, Summary, summarise
-from simharness.play.records import ModelRecord, Run, RunSettings
+from simharness.play.records import ModelRecord, Run
+from simharness.play.settings import RunSettings
 from simharness.report.plot import Panel, plot
 from simharness.report.report import numbers, title
 

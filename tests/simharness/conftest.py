@@ -12,7 +12,8 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simharness.play.records import AttemptRecord, Latency, NoGraspRecord, RoundEnd, RoundRecord, RunSettings
+from simharness.play.records import AttemptRecord, Latency, NoGraspRecord, RoundEnd, RoundRecord
+from simharness.play.settings import RunSettings
 
 STUB = Path(__file__).with_name("stub_service.py")
 

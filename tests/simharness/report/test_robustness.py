@@ -12,8 +12,9 @@ import pytest
 from simharness.__main__ import main
 from simharness.errors import UsageError
 from simharness.play.metrics import Rate
-from simharness.play.records import ModelRecord, Run, RunSettings
+from simharness.play.records import ModelRecord, Run
 from simharness.play.round import camera_noise
+from simharness.play.settings import RunSettings
 from simharness.report.plot import Panel, plot
 from simharness.report.robustness import AXES, AXIS_NAMES, Condition, Study, conditions
 

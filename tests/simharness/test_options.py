@@ -1,0 +1,96 @@
+from __future__ import annotations
+
+from dataclasses import fields
+from pathlib import Path
+from typing import Any, Literal, get_args, get_origin
+
+import pytest
+
+from simharness.errors import UsageError
+from simharness.options import out_of, robustness_parser, run_parser, settings_of
+from simharness.play.settings import RunSettings, flags
+
+
+def asked(*arguments: str) -> RunSettings:
+    return settings_of(run_parser().parse_args(arguments))
+
+
+def test_nothing_said_asks_for_the_defaults_of_the_flags() -> None:
+    settings = asked()
+    for name, (_, flag) in flags().items():
+        assert getattr(settings, name) == (flag.default if name != "objects" else "procedural")
+    assert (settings.seeds, settings.max_grasps) == ((0,), 1)
+
+
+@pytest.mark.parametrize("name", list(flags()))
+def test_every_flag_reaches_its_setting_and_no_other(name: str) -> None:
+    kind, flag = flags()[name]
+    value: Any = "other"
+    if get_origin(kind) is Literal:
+        value = next(choice for choice in get_args(kind) if choice != flag.default)
+    elif flag.least is not None:
+        value = flag.least
+    elif flag.within is not None:
+        value = (flag.within.low + flag.within.high) / 2
+    elif bool in get_args(kind):
+        value = True
+    option = f"--{name.replace('_', '-')}"
+    given, nothing = asked(option, *([] if value is True else [str(value)])), asked()
+    changed = {
+        field.name for field in fields(RunSettings) if getattr(given, field.name) != getattr(nothing, field.name)
+    }
+    assert getattr(given, name) == value
+    assert changed == ({"scene", "objects"} if name == "scene" else {name})
+
+
+def test_only_seeds_and_the_number_of_grasps_are_asked_for_otherwise() -> None:
+    assert {field.name for field in fields(RunSettings)} - set(flags()) == {"seeds", "max_grasps"}
+    assert asked("--seed", "3").seeds == (3,)
+    assert asked("--seeds", "3", "1").seeds == (3, 1)
+    assert asked("--watch").max_grasps > 1
+
+
+def test_help_states_every_default() -> None:
+    text = " ".join(run_parser().format_help().split())
+    for name, (_, flag) in flags().items():
+        assert f"--{name.replace('_', '-')}" in text
+        if flag.default is not None:
+            assert f"(default {flag.default})" in text
+
+
+def test_piles_are_made_of_other_objects_unless_some_are_named() -> None:
+    assert asked("--scene", "pile").objects == "pybullet-random"
+    assert asked("--scene", "pile", "--objects", "procedural").objects == "procedural"
+
+
+def test_files_are_found_again_from_anywhere(tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tmp_path / "list.txt").write_text("")
+    monkeypatch.chdir(tmp_path)
+    settings = asked("--objects", "list.txt", "--exclude", "list.txt", "--only", "missing.txt")
+    assert settings.objects == settings.exclude == str((tmp_path / "list.txt").resolve())
+    assert settings.only == "missing.txt"
+
+
+def test_a_study_has_the_random_camera_as_it_is() -> None:
+    options = robustness_parser().parse_args(["--rounds", "3"])
+    assert settings_of(options) == asked("--rounds", "3")
+    with pytest.raises(SystemExit):
+        robustness_parser().parse_args(["--voxel-size", "0.005"])
+
+
+def test_flags_that_do_not_go_together_are_refused() -> None:
+    with pytest.raises(UsageError, match="named twice"):
+        asked("--seeds", "1", "1")
+    with pytest.raises(UsageError, match="leave out --ray"):
+        asked("--watch", "--ray", "auto")
+    with pytest.raises(UsageError, match="--out"):
+        asked("--resume")
+
+
+def test_reports_go_where_they_are_wanted() -> None:
+    options = run_parser().parse_args(["--out", "here"])
+    assert out_of(options, settings_of(options)) == Path("here")
+    options = run_parser().parse_args(["--scene", "pile", "--executor", "strict"])
+    found = out_of(options, settings_of(options), "robustness-")
+    assert found.parent == Path("runs")
+    assert found.name.startswith("robustness-pile-strict-")
