@@ -12,8 +12,13 @@ from typing import Any
 import numpy as np
 import pytest
 
-from simharness.play.records import AttemptRecord, Latency, NoGraspRecord, RoundEnd, RoundRecord
+from simharness.play.records import AttemptRecord, Latency, NoGraspRecord, RoundEnd, RoundRecord, Run
+from simharness.play.round import play_round
 from simharness.play.settings import RunSettings
+from simharness.sim.objects import ObjectModel, load_object_set
+from tests.simharness.commands import run_it
+from tests.simharness.planners import TopDown
+from tests.simharness.recorded import MODEL, SERVING
 
 STUB = Path(__file__).with_name("stub_service.py")
 
@@ -108,3 +113,44 @@ def make_round() -> MakeRound:
         return RoundRecord(seed, number, objects, ended, attempts, empty)
 
     return make
+
+
+@pytest.fixture
+def run(make_settings: Any, make_round: Any) -> Run:
+    """A finished run of two seeds, with every way to end a round."""
+    rounds = (
+        make_round(0, 0, ["success"] * 5),
+        make_round(0, 1, ["slip", "drop"], ("no_candidates",), "two_failures"),
+        make_round(1, 0, ["success", "approach", "success"]),
+        make_round(1, 1, [], ("no_candidates",) * 3, "no_grasps"),
+    )
+    return Run(make_settings(seeds=(0, 1)), 2, MODEL, SERVING, rounds, None)
+
+
+@pytest.fixture(scope="module")
+def objects() -> tuple[ObjectModel, ...]:
+    """The test objects of packed scenes."""
+    return load_object_set("procedural", "packed")
+
+
+@pytest.fixture(scope="module")
+def played(objects: tuple[ObjectModel, ...], make_settings: Any) -> RoundRecord:
+    """A round of a planner that is right most of the time."""
+    return play_round(make_settings(), objects, TopDown(), 0, 1)
+
+
+@pytest.fixture(scope="module")
+def two_rounds(tmp_path_factory: pytest.TempPathFactory, stub_command: tuple[str, ...]) -> Path:
+    """A finished run of two rounds by one worker."""
+    out = tmp_path_factory.mktemp("run") / "out"
+    stub = subprocess.Popen(stub_command, stdout=subprocess.PIPE, text=True)
+    assert stub.stdout is not None
+    try:
+        done = run_it("--rounds", 2, "--url", stub.stdout.readline().strip(), "--workers", 1, "--out", out)
+    finally:
+        stub.terminate()
+        stub.communicate()
+    assert done.returncode == 0, done.stderr
+    (out.parent / "stdout").write_text(done.stdout)
+    (out.parent / "stderr").write_text(done.stderr)
+    return out

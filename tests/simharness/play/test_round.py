@@ -1,77 +1,28 @@
 from __future__ import annotations
 
-from collections.abc import Iterable
 from typing import Any
 
 import numpy as np
 import pytest
 
-from simharness.errors import UsageError
-from simharness.play.records import AttemptRecord, RoundRecord
-from simharness.play.replay import find_attempt, replay
+from simharness.play.records import RoundRecord
 from simharness.play.round import (
     Attempted,
     Observed,
-    Plan,
     camera_noise,
     camera_rng,
     play_round,
     request_seed,
     scene_rng,
 )
-from simharness.sim.camera import Observation
-from simharness.sim.objects import ObjectModel, load_object_set
+from simharness.sim.objects import ObjectModel
+from tests.simharness.planners import Scripted, TopDown
 
 pytestmark = pytest.mark.sim
 
 
-class TopDown:
-    """Grasps the highest thing from above, across its shorter side."""
-
-    def __init__(self) -> None:
-        self.seeds: list[int] = []
-
-    def plan(self, observation: Observation, seed: int) -> Plan:
-        self.seeds.append(seed)
-        points = observation.points_world.astype(np.float64)
-        top = points[points[:, 2].argmax()]
-        near = points[np.linalg.norm(points[:, :2] - top[:2], axis=1) < 0.03]
-        _, axes = np.linalg.eigh(np.cov((near - near.mean(axis=0))[:, :2].T))
-        y, z = np.array([*axes[:, 0], 0.0]), np.array([0.0, 0.0, -1.0])
-        pose = np.eye(4)
-        pose[:3, :3] = np.stack([np.cross(y, z), y, z], axis=1)
-        pose[:3, 3] = [*near.mean(axis=0)[:2], max(top[2] - 0.03, 0.064)]
-        response = {"counts": {"points": len(points)}, "timings_ms": {"total": 1.0}}
-        return Plan(pose[None], np.array([0.5]), np.array([0.08]), 2.0, response)
-
-
-class Scripted:
-    """Says in turn what it was given: a reason for no grasp, or None for a grasp in empty air."""
-
-    def __init__(self, script: Iterable[str | None]) -> None:
-        self._script = iter(script)
-
-    def plan(self, observation: Observation, seed: int) -> Plan:
-        reason = next(self._script)
-        if reason is not None:
-            return Plan.nothing(reason)
-        air = np.diag([1.0, -1.0, -1.0, 1.0])
-        air[:3, 3] = [0.15, 0.15, 0.6]
-        return Plan(air[None], np.array([0.5]), np.array([0.08]), 2.0)
-
-
-@pytest.fixture(scope="module")
-def objects() -> tuple[ObjectModel, ...]:
-    return load_object_set("procedural", "packed")
-
-
 def plain(record: RoundRecord) -> Any:
     return record.to_json(), [attempt.to_json() for attempt in record.attempts]
-
-
-@pytest.fixture(scope="module")
-def played(objects: tuple[ObjectModel, ...], make_settings: Any) -> RoundRecord:
-    return play_round(make_settings(), objects, TopDown(), 0, 1)
 
 
 def test_a_good_planner_clears_tables(played: RoundRecord) -> None:
@@ -173,29 +124,3 @@ def test_the_cameras_noise_can_be_replaced(make_settings: Any) -> None:
     assert camera_noise(make_settings(noise_std=0.002)).point_sigma == 0.002
     assert camera_noise(make_settings(camera="giga", noise_std=0.0)).dex
     assert camera_noise(make_settings(depth_noise_std=0.001)).depth_sigma == 0.001
-
-
-def test_a_replayed_attempt_ends_as_recorded(
-    played: RoundRecord, objects: tuple[ObjectModel, ...], make_settings: Any
-) -> None:
-    last = len(played.attempts) - 1
-    stored = RoundRecord.from_json(
-        played.to_json(), tuple(AttemptRecord.from_json(attempt.to_json()) for attempt in played.attempts)
-    )
-    events = replay(make_settings(), objects, stored, last)
-    assert len(events) == len(played.attempts)
-    for event, attempt in zip(events, played.attempts, strict=True):
-        assert {**event.record.to_json(), "latency_ms": None} == {**attempt.to_json(), "latency_ms": None}
-
-
-def test_a_replay_that_goes_another_way_says_so(
-    played: RoundRecord, objects: tuple[ObjectModel, ...], make_settings: Any
-) -> None:
-    with pytest.raises(UsageError, match="ended as"):
-        replay(make_settings(), objects[: len(objects) // 2], played, 0)
-
-
-def test_an_attempt_that_was_not_made_is_refused(played: RoundRecord) -> None:
-    assert find_attempt([played, played], len(played.attempts)) is played.attempts[0]
-    with pytest.raises(UsageError, match=r"--attempt 99.*give 0 to"):
-        find_attempt([played], 99)

@@ -11,11 +11,9 @@ import pytest
 
 from simharness.__main__ import main
 from simharness.errors import UsageError
-from simharness.play.metrics import Rate
 from simharness.play.records import ModelRecord, Run
 from simharness.play.round import camera_noise
 from simharness.play.settings import RunSettings
-from simharness.report.plot import Panel, plot
 from simharness.report.robustness import AXES, AXIS_NAMES, Condition, Study, conditions
 
 MODEL = ModelRecord("tesnet", "1.2", "ab" * 32)
@@ -71,17 +69,6 @@ def test_runs_of_two_models_are_not_compared(make_settings: Any, make_round: Any
     study.add(first, finished(make_settings(), make_round))
     with pytest.raises(UsageError, match=f"{second.name} was played with"):
         study.add(second, finished(make_settings(), make_round, ModelRecord("tesnet", "1.3", "cd" * 32)))
-
-
-def test_higher_rates_are_drawn_higher_and_nothing_where_nothing_was_counted() -> None:
-    drawing = ET.fromstring(
-        plot("<a & b>", [Panel("p", ["x", "y", "z"], 2, {"GSR": [Rate(9, 10), Rate(5, 10), None]})])
-    )
-    high, low = (
-        float(circle.attrib["cy"]) for circle in drawing.findall(".//{*}circle") if circle.find("{*}title") is not None
-    )
-    assert high < low
-    assert "<a & b>" in [text.text for text in drawing.findall(".//{*}text")]
 
 
 @pytest.mark.sim

@@ -7,7 +7,6 @@ import json
 import numpy as np
 import pytest
 
-from simharness.errors import LoadError
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import (
     RESTING_SPEED,
@@ -20,7 +19,6 @@ from simharness.sim.scene import (
     settle,
 )
 from simharness.sim.world import World, data_path
-from tesnet.geometry import Pose
 
 pytestmark = pytest.mark.sim
 
@@ -90,8 +88,3 @@ def test_an_object_that_leaves_the_workspace_is_taken_out_and_reported() -> None
         assert settle(world) == (runaway,)
         assert runaway not in world.objects
         assert len(world.objects) == len(scene.placed) - 1
-
-
-def test_a_body_that_cannot_be_loaded_is_named() -> None:
-    with World() as world, pytest.raises(LoadError, match=r"nowhere\.urdf: no such file"):
-        world.load_urdf("nowhere.urdf", Pose.identity())

@@ -1,0 +1,38 @@
+from __future__ import annotations
+
+from typing import Any
+
+import pytest
+
+from simharness.errors import UsageError
+from simharness.play.records import AttemptRecord, RoundRecord
+from simharness.play.replay import find_attempt, replay
+from simharness.sim.objects import ObjectModel
+
+pytestmark = pytest.mark.sim
+
+
+def test_a_replayed_attempt_ends_as_recorded(
+    played: RoundRecord, objects: tuple[ObjectModel, ...], make_settings: Any
+) -> None:
+    last = len(played.attempts) - 1
+    stored = RoundRecord.from_json(
+        played.to_json(), tuple(AttemptRecord.from_json(attempt.to_json()) for attempt in played.attempts)
+    )
+    events = replay(make_settings(), objects, stored, last)
+    assert len(events) == len(played.attempts)
+    for event, attempt in zip(events, played.attempts, strict=True):
+        assert {**event.record.to_json(), "latency_ms": None} == {**attempt.to_json(), "latency_ms": None}
+
+
+def test_a_replay_that_goes_another_way_says_so(
+    played: RoundRecord, objects: tuple[ObjectModel, ...], make_settings: Any
+) -> None:
+    with pytest.raises(UsageError, match="ended as"):
+        replay(make_settings(), objects[: len(objects) // 2], played, 0)
+
+
+def test_an_attempt_that_was_not_made_is_refused(played: RoundRecord) -> None:
+    assert find_attempt([played, played], len(played.attempts)) is played.attempts[0]
+    with pytest.raises(UsageError, match=r"--attempt 99.*give 0 to"):
+        find_attempt([played], 99)
