@@ -11,11 +11,12 @@ ROOT = Path(__file__).resolve().parents[1]
 COMMANDS = {
     "service/__main__.py": "tests/service/test_process.py",
     "client/__main__.py": "tests/client/test_command.py",
+    "simharness/__main__.py": "tests/simharness/test_cli.py",
 }
 """What `python -m` starts is tested as its user meets it."""
 
 
-@pytest.mark.parametrize("package", ["client", "service"])
+@pytest.mark.parametrize("package", ["client", "service", "simharness"])
 def test_every_module_has_a_test_file_of_its_name_or_of_its_package(package: str) -> None:
     modules = [path.relative_to(ROOT) for path in sorted((ROOT / package).rglob("*.py")) if path.name != "__init__.py"]
     assert modules
