@@ -48,6 +48,7 @@ class BackgroundHandler(logging.Handler):
         super().__init__()
         self._descriptor = descriptor
         self._lost = 0
+        self._counting = threading.Lock()
         self._lines: queue.Queue[str | None] = queue.Queue(QUEUED_LINES)
         self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
         self._thread.start()
@@ -67,17 +68,26 @@ class BackgroundHandler(logging.Handler):
         try:
             self._lines.put_nowait(line)
         except queue.Full:
-            self._lost += 1
+            self._count(1)
 
     def _write_all(self) -> None:
         while (line := self._lines.get()) is not None:
             if not self._write(line):
-                self._lost += 1
-            elif self._lost:
-                lost, self._lost = self._lost, 0
+                self._count(1)
+            elif lost := self._counted():
                 values = {"name": __name__, "levelname": "WARNING", "msg": "log lines lost", "fields": {"lines": lost}}
                 if not self._write(self.format(logging.makeLogRecord(values))):
-                    self._lost += lost
+                    self._count(lost)
+
+    def _count(self, lost: int) -> None:
+        with self._counting:  # lines are lost in every thread that logs
+            self._lost += lost
+
+    def _counted(self) -> int:
+        """How many lines were lost since this was last asked."""
+        with self._counting:
+            lost, self._lost = self._lost, 0
+        return lost
 
     def _write(self, line: str) -> bool:
         rest = memoryview(f"{line}\n".encode())
