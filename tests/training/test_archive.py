@@ -67,8 +67,20 @@ def test_more_views_show_the_labels_of_their_scene_from_new_cameras(labels: Path
                     outcome in of_old[np.abs(old_poses - pose).max(axis=(1, 2)) < 2e-2]
                     for old_poses, of_old in recorded
                 )
-            assert torch.equal(view.collision_free, is_free(view.cloud, view.candidates))
+            free, clear = surely_free(view)
+            assert torch.equal(view.collision_free[clear], free[clear])
+            assert clear.float().mean() > 0.5
     assert shown > 0
+
+
+def surely_free(view: LabelledView) -> tuple[torch.Tensor, torch.Tensor]:
+    """What the cloud leaves free, and where that holds however the file rounded the points (half a step of float16)."""
+    generator = torch.Generator().manual_seed(0)
+    noise = 2e-4 * torch.rand(16, *view.cloud.points.shape, generator=generator) - 1e-4
+    votes = torch.stack(
+        [is_free(replace(view.cloud, points=view.cloud.points + moved), view.candidates) for moved in noise]
+    )
+    return votes[0], (votes == votes[0]).all(dim=0)
 
 
 def test_shallow_pairs_come_back_straight_down(labels: Path, tmp_path: Path) -> None:
