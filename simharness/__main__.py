@@ -33,6 +33,7 @@ from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFol
 from simharness.play.photographer import attempts_to_show, keep_only, take_pictures
 from simharness.play.records import Run
 from simharness.play.replay import find_attempt, replay
+from simharness.play.round import camera_noise
 from simharness.play.run import Hooks, run
 from simharness.play.settings import RunSettings
 from simharness.report.causes import failures, failures_report, failures_table
@@ -40,6 +41,7 @@ from simharness.report.page import page
 from simharness.report.progress import Progress
 from simharness.report.report import package_versions, report, table
 from simharness.report.robustness import JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
+from simharness.sim.camera import check_sensing
 from simharness.sim.objects import ObjectModel, load_object_set
 
 if TYPE_CHECKING:
@@ -96,6 +98,7 @@ def _robustness(options: argparse.Namespace) -> int:
 
 def _clear(options: argparse.Namespace, settings: RunSettings, folder: RunFolder) -> tuple[Run, int]:
     """Carry a run out, leave its reports, print its table; the run and the exit code."""
+    check_sensing(settings.camera, camera_noise(settings))
     objects = _objects(settings)
     signals = _Signals()
     with ExitStack() as stack:

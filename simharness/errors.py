@@ -6,6 +6,7 @@
     +-- LoadError         a URDF or mesh that Bullet cannot load; `path` names it
     +-- ObjectSetError    an object set that is unknown, empty or broken
     +-- UsageError        an option, a folder or a recorded run that cannot be used
+        +-- MissingExtra  what was asked for needs a library of another extra of pyproject.toml
     +-- RunBroken         the service or a worker process failed in mid-run; what was done is kept
 
 Messages give the value, the limit and the remedy.
@@ -13,6 +14,8 @@ Messages give the value, the limit and the remedy.
 
 from __future__ import annotations
 
+from collections.abc import Iterator
+from contextlib import contextmanager
 from pathlib import Path
 
 
@@ -52,6 +55,40 @@ class ObjectSetError(SimError):
 
 class UsageError(SimError):
     """The command asks for something that cannot be done."""
+
+
+class MissingExtra(UsageError):
+    """A library that only some runs need is not installed, or cannot be loaded.
+
+    Args:
+        what: what needs it, as the beginning of a sentence.
+        extra: the extra of pyproject.toml that brings it.
+        why: what its import said.
+    """
+
+    def __init__(self, what: str, extra: str, why: str) -> None:
+        super().__init__(
+            f"{what} the extra `{extra}`: {why}; pip install -e '.[{extra}]', or, where a shared object is missing, "
+            "the system package that holds it"
+        )
+        self.extra = extra
+
+
+@contextmanager
+def from_extra(extra: str, what: str) -> Iterator[None]:
+    """Around the import of a library that only some runs need.
+
+    Args:
+        extra: the extra of pyproject.toml that brings the library.
+        what: what needs it, as the beginning of a sentence: "camera multi3 needs".
+
+    Raises:
+        MissingExtra: the import failed, or a system library that it loads is missing.
+    """
+    try:
+        yield
+    except (ImportError, OSError) as error:
+        raise MissingExtra(what, extra, str(error)) from error
 
 
 class RunBroken(SimError):

@@ -12,6 +12,8 @@ import pytest
 from packaging.requirements import Requirement
 from packaging.utils import canonicalize_name
 
+from tests.conftest import PATIENCE_S
+
 if sys.version_info >= (3, 11):
     import tomllib
 else:
@@ -30,7 +32,7 @@ EXTRAS = {
     "client": (),
     "tesnet": ("service",),
     "service": ("service", "ray"),  # of which only service.deploy.ray needs Ray
-    "simharness": ("sim", "ray"),  # of which only the option --ray needs Ray
+    "simharness": ("sim", "fusion", "sensors", "watch", "ray"),  # of which only options need all but the first
     "training": ("service", "sim"),
     "bench": ("service", "dev"),  # fuzzing needs what generates requests
 }
@@ -81,6 +83,9 @@ def test_every_declared_dependency_of_an_extra_is_imported_by_its_packages() -> 
         ("files",): ("tesnet",),
         ("service",): ("tesnet", "service"),
         ("sim",): ("simharness",),
+        ("fusion",): ("simharness",),
+        ("sensors",): ("simharness",),
+        ("watch",): ("simharness",),
         ("ray",): ("service",),
     }.items():
         used = {name for package in packages for path in (ROOT / package).rglob("*.py") for name in _imported(path)}
@@ -115,7 +120,7 @@ def test_light_modules_load_nothing_heavy(package: str) -> None:
     heavy = ("torch", "fastapi", "starlette", "uvicorn", "pybullet", "open3d", "trimesh", "matplotlib", "safetensors")
     program = f"import {package}, sys; print(*[name for name in {heavy!r} if name in sys.modules])"
     done = subprocess.run(
-        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=60, check=True
+        [sys.executable, "-c", program], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=True
     )
     assert done.stdout.strip() == ""
 
@@ -127,8 +132,11 @@ def test_an_installation_carries_the_weights_their_card_and_their_checksum() -> 
         assert any(Path(name).match(pattern) for pattern in patterns), name
 
 
+@pytest.mark.needs("git")
 def test_no_tracked_text_names_one_machine_or_a_package_host() -> None:
-    listed = subprocess.run(["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, timeout=30, check=True)
+    listed = subprocess.run(
+        ["git", "ls-files", "-z"], cwd=ROOT, capture_output=True, text=True, timeout=PATIENCE_S, check=True
+    )
     forbidden = re.compile(r"/home/[a-z]|/opt/[w]heels|pypi[.]org|pythonhosted[.]org|registry[.]npmjs")
     for name in filter(None, listed.stdout.split("\0")):
         path = ROOT / name

@@ -11,7 +11,6 @@ from collections.abc import Iterable
 import numpy as np
 from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 from PIL import Image, ImageDraw
-from scipy.ndimage import distance_transform_edt
 
 from simharness.sim.scene import TABLE_HEIGHT, WORKSPACE
 from tesnet.geometry import PANDA, CameraIntrinsics, Pose
@@ -110,9 +109,23 @@ def widen(
     """An image in which every pixel has the colour of the nearest known one."""
     if not known.any():
         return image
-    rows, columns = distance_transform_edt(~known, return_distances=False, return_indices=True)
-    widened: UInt8[np.ndarray, "height width 3"] = image[rows, columns]
+    nearest, off = _nearest_in_column(known)
+    candidates = np.flatnonzero(known.any(axis=0))
+    aside = (np.arange(known.shape[1], dtype=np.int32)[:, None] - candidates.astype(np.int32)) ** 2
+    columns = np.stack([candidates[(aside + of_row[candidates] ** 2).argmin(axis=1)] for of_row in off])
+    widened: UInt8[np.ndarray, "height width 3"] = image[np.take_along_axis(nearest, columns, axis=1), columns]
     return widened
+
+
+def _nearest_in_column(
+    known: Bool[np.ndarray, "height width"],
+) -> tuple[Int32[np.ndarray, "height width"], Int32[np.ndarray, "height width"]]:
+    """The row of the nearest known pixel in each pixel's own column and how many rows off it is; any where none is."""
+    row, far = np.arange(len(known), dtype=np.int32)[:, None], np.int32(2 * len(known))
+    above = np.maximum.accumulate(np.where(known, row, -far))
+    below = np.minimum.accumulate(np.where(known, row, far)[::-1])[::-1]
+    nearest = np.where(row - above <= below - row, above, below)
+    return nearest, np.abs(nearest - row)
 
 
 def point_colours(

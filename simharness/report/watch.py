@@ -2,14 +2,15 @@
 
 from __future__ import annotations
 
+import importlib
 import io
 from contextlib import redirect_stdout
 from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import numpy as np
-import viser
 
+from simharness.errors import from_extra
 from simharness.play.metrics import Summary
 from simharness.play.photographer import observed_colours
 from simharness.play.pictures import (
@@ -54,6 +55,8 @@ class Watcher:
         self._server: Any = None
 
     def __enter__(self) -> Self:
+        with from_extra("watch", "--watch needs"):
+            viser: Any = importlib.import_module("viser")
         # viser greets on stdout, which belongs to the run's table.
         with redirect_stdout(io.StringIO()):
             self._server = viser.ViserServer(host="127.0.0.1", port=self._port, label="Clutter removal", verbose=False)

@@ -13,8 +13,8 @@ from typing import Any, Literal, get_args
 import numpy as np
 from jaxtyping import Float32, Float64, Int32, UInt8
 from numpy.typing import NDArray
-from scipy import ndimage
 
+from simharness.errors import from_extra
 from simharness.sim.scene import PERCEPTION_BOX, WORKSPACE
 from simharness.sim.world import World
 from tesnet.geometry import CameraIntrinsics, Pose
@@ -22,6 +22,8 @@ from tesnet.query import Box
 
 Preset = Literal["random", "giga", "multi3", "vgn6"]
 PRESETS: tuple[Preset, ...] = get_args(Preset)
+FUSED: tuple[Preset, ...] = ("multi3", "vgn6")
+"""Presets of several views, which become one cloud."""
 
 INTRINSICS = CameraIntrinsics(width=640, height=480, fx=540.0, fy=540.0, cx=320.0, cy=240.0)
 NEAR, FAR = 0.1, 2.0
@@ -216,7 +218,7 @@ def add_depth_noise(
     if noise.dex:
         noisy = noisy * rng.gamma(1000.0, 0.001)
         coarse = rng.normal(0.0, 0.005, (depth.shape[0] // 4, depth.shape[1] // 4))
-        noisy = noisy + ndimage.zoom(coarse, 4, order=3, mode="nearest", grid_mode=True)
+        noisy = noisy + _ndimage().zoom(coarse, 4, order=3, mode="nearest", grid_mode=True)
     if noise.depth_sigma > 0:
         noisy = noisy + rng.normal(0.0, noise.depth_sigma, depth.shape)
     return np.where(seen, np.maximum(noisy, 1e-3), 0.0).astype(np.float32)
@@ -266,8 +268,7 @@ def _fuse(depths: Sequence[NDArray[np.float32]], cameras: Sequence[Pose]) -> NDA
 
     Curless and Levoy, "A volumetric method for building complex models from range images" (SIGGRAPH 1996), by Open3D.
     """
-    # 400 MB and system libraries that single views do without, hence not at the top.
-    open3d: Any = importlib.import_module("open3d")
+    open3d = _open3d()
     size = float((WORKSPACE.maximum - WORKSPACE.minimum).max())
     integration = open3d.pipelines.integration
     volume = integration.UniformTSDFVolume(
@@ -287,3 +288,26 @@ def _fuse(depths: Sequence[NDArray[np.float32]], cameras: Sequence[Pose]) -> NDA
         )
         volume.integrate(image, intrinsic, camera.inverse().matrix)
     return np.asarray(volume.extract_point_cloud().points, dtype=np.float64).reshape(-1, 3)
+
+
+def check_sensing(preset: Preset, noise: Noise) -> None:
+    """Load what a camera and its noise need beyond the extra `sim`.
+
+    Raises:
+        MissingExtra: it is not installed; the message names the extra that brings it.
+    """
+    if preset in FUSED:
+        _open3d()
+    if noise.dex:
+        _ndimage()
+
+
+def _open3d() -> Any:
+    # 400 MB and system libraries that single views do without, hence not at the top.
+    with from_extra("fusion", "a camera whose views are fused needs"):
+        return importlib.import_module("open3d")
+
+
+def _ndimage() -> Any:
+    with from_extra("sensors", "the noise of camera giga (--dex-noise) needs"):
+        return importlib.import_module("scipy.ndimage")

@@ -17,8 +17,9 @@ from typing import Any
 
 from simharness.__main__ import main
 from simharness.play.records import TIMING_KEYS
+from tests.conftest import PATIENCE_S
 
-WAIT_S = 300.0
+WAIT_S = PATIENCE_S
 
 
 @dataclass(frozen=True)

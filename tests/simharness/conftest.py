@@ -16,7 +16,7 @@ from simharness.play.records import AttemptRecord, Latency, NoGraspRecord, Round
 from simharness.play.round import play_round
 from simharness.play.settings import RunSettings
 from simharness.sim.objects import ObjectModel, load_object_set
-from tests.simharness.commands import run_it
+from tests.simharness.commands import WAIT_S, run_it
 from tests.simharness.planners import TopDown
 from tests.simharness.recorded import MODEL, SERVING
 
@@ -48,7 +48,7 @@ def _stub(options: tuple[str, ...]) -> Iterator[str]:
         yield process.stdout.readline().strip()
     finally:
         process.terminate()
-        process.wait(10)
+        process.wait(WAIT_S)
         process.stdout.close()
 
 

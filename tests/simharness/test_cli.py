@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import os
 import signal
+import sys
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +61,25 @@ def test_ctrl_c_ends_cleanly_and_leaves_no_process(start_stub: Any, tmp_path: Pa
     assert 1 <= report["rounds"] < 500
     assert report["no_grasps"] == {"no_candidates": 3 * report["rounds"]}
     assert "INCOMPLETE: interrupted" in output
+
+
+@pytest.mark.parametrize(
+    ("module", "extra", "arguments"),
+    [
+        ("open3d", "fusion", ["--camera", "multi3"]),
+        ("scipy.ndimage", "sensors", ["--camera", "giga"]),
+        ("scipy.ndimage", "sensors", ["--dex-noise"]),
+        ("viser", "watch", ["--watch"]),
+    ],
+)
+def test_an_option_whose_extra_is_missing_names_it_before_anything_is_played(
+    module: str, extra: str, arguments: list[str], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setitem(sys.modules, module, None)  # to Python: not installed
+    done = run_it("--rounds", 1, "--url", "http://127.0.0.1:9", "--out", tmp_path / "out", *arguments)
+    assert done.returncode == 2
+    assert f"pip install -e '.[{extra}]'" in done.stderr
+    assert not (tmp_path / "out").exists()
 
 
 @pytest.mark.parametrize(

@@ -4,7 +4,7 @@ import pickle
 
 import pytest
 
-from simharness.errors import LoadError, ObjectSetError, RunBroken, SimError, UsageError
+from simharness.errors import LoadError, MissingExtra, ObjectSetError, RunBroken, SimError, UsageError, from_extra
 
 
 @pytest.mark.parametrize(
@@ -24,3 +24,12 @@ def test_every_error_is_the_packages_own_and_says_all_it_knows(error: SimError, 
 def test_what_broke_a_run_can_be_told_from_another_process() -> None:
     again = pickle.loads(pickle.dumps(RunBroken("a worker ended")))
     assert (type(again), str(again)) == (RunBroken, "a worker ended")
+
+
+@pytest.mark.parametrize("error", [ModuleNotFoundError("No module named 'open3d'"), OSError("libGL.so.1: cannot open")])
+def test_a_library_that_cannot_be_loaded_names_the_extra_that_brings_it(error: Exception) -> None:
+    with (
+        pytest.raises(MissingExtra, match=rf"a camera needs the extra `fusion`: {error}; pip install -e '.\[fusion\]'"),
+        from_extra("fusion", "a camera needs"),
+    ):
+        raise error

@@ -5,6 +5,7 @@ import io
 import numpy as np
 import pytest
 from PIL import Image
+from scipy.ndimage import distance_transform_edt
 
 from simharness.play.pictures import (
     PICTURE_SIZE,
@@ -78,6 +79,18 @@ def test_points_beside_an_object_get_its_colour() -> None:
     assert (widen(image, known) == image).all()
     known[1, 1] = True
     assert (widen(image, known) == 200).all()
+
+
+@pytest.mark.parametrize(("shape", "share"), [((40, 30), 0.02), ((9, 25), 0.3), ((1, 7), 0.3), ((31, 1), 0.1)])
+def test_an_image_is_widened_by_the_nearest_pixels(shape: tuple[int, int], share: float) -> None:
+    rng = np.random.default_rng(4)
+    known = rng.random(shape) < share
+    known.flat[rng.integers(known.size)] = True
+    numbered = np.stack([*np.indices(shape), np.zeros(shape)], axis=2).astype(np.uint8)
+    rows, columns, _ = np.moveaxis(widen(numbered, known).astype(int), 2, 0)
+    assert known[rows, columns].all()
+    chosen = np.hypot(*(np.stack([rows, columns]) - np.indices(shape)))
+    np.testing.assert_allclose(chosen, distance_transform_edt(~known))
 
 
 def test_what_points_hide_of_the_hand_is_pale() -> None:

@@ -133,6 +133,7 @@ def test_a_thinned_cloud_keeps_the_mean_of_each_voxel() -> None:
     assert thin(np.empty((0, 3)), 0.01).shape == (0, 3)
 
 
+@pytest.mark.needs("open3d")
 def test_fused_views_show_every_side_of_the_box(world: World) -> None:
     observation = observe(world, "multi3", np.random.default_rng(0), Noise())
     points = observation.points_world.astype(np.float64)
