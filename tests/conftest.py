@@ -1,4 +1,7 @@
-"""What tests of several packages share: the real service, in a process of its own."""
+"""What tests of several packages share: the real service, in a process of its own; what to do without a needed program.
+
+A test that waits, waits for at most `PATIENCE_S`: so long that only a test that hangs ever does, on any machine.
+"""
 
 from __future__ import annotations
 
@@ -17,7 +20,49 @@ from typing import Any
 
 import pytest
 
-START_TIMEOUT_S = 300.0
+from tests.needs import Part, missing, packages
+
+PATIENCE_S = 300.0
+"""For what takes a moment on a quiet machine: a service to start, an answer, a process to end."""
+
+MISSING = pytest.StashKey[list[Part]]()
+
+
+def pytest_addoption(parser: pytest.Parser) -> None:
+    parser.addoption(
+        "--no-gaps", action="store_true", help="fail where a program or system library is missing that a test needs"
+    )
+
+
+@pytest.hookimpl(tryfirst=True)  # before any fixture starts a service
+def pytest_runtest_setup(item: pytest.Item) -> None:
+    absent = missing(name for mark in item.iter_markers("needs") for name in mark.args)
+    if not absent:
+        return
+    item.user_properties += [("missing", (part.name, part.package)) for part in absent]
+    why = f"missing: {', '.join(part.name for part in absent)}; apt-get install {' '.join(packages(absent))}"
+    if item.config.getoption("no_gaps"):
+        pytest.fail(why, pytrace=False)
+    pytest.skip(why)
+
+
+def pytest_terminal_summary(terminalreporter: pytest.TerminalReporter) -> None:
+    """One block of what was left out, and what would bring it."""
+    reports = [report for outcome in ("skipped", "failed", "error") for report in terminalreporter.getreports(outcome)]
+    gaps: dict[tuple[str, str], list[str]] = {}
+    for report in reports:
+        for name, part in getattr(report, "user_properties", ()):
+            if name == "missing":
+                gaps.setdefault(tuple(part), []).append(report.nodeid)
+    if not gaps:
+        return
+    terminalreporter.section("left out: what they need is not on this machine")
+    for (name, package), tests in sorted(gaps.items()):
+        terminalreporter.line(f"{name} (Debian: {package}), for")
+        for test in tests:
+            terminalreporter.line(f"    {test}")
+    line = " ".join(sorted({package for _, package in gaps}))
+    terminalreporter.line(f"To run them all: apt-get install --no-install-recommends {line}", bold=True)
 
 
 @dataclass
@@ -30,7 +75,7 @@ class ServiceProcess:
 
     def wait_for(self, event: str, **fields: Any) -> dict[str, Any]:
         """The first log line of this event with these fields that was not waited for before."""
-        deadline = time.monotonic() + START_TIMEOUT_S
+        deadline = time.monotonic() + PATIENCE_S
         while True:
             line = self.arrived.get(timeout=max(0.0, deadline - time.monotonic()))
             if line is None:
@@ -69,13 +114,22 @@ def hears(pid: int, number: int) -> bool:
 StartService = Callable[..., Any]
 
 
+SERVED_HERE = {
+    "GRASP_HOST": "127.0.0.1",
+    "GRASP_PORT": "0",
+    "GRASP_DEVICE": "cpu",
+    "GRASP_REQUEST_TIMEOUT": f"{PATIENCE_S:g}",
+}
+"""Settings of services that tests start, unless a test says otherwise."""
+
+
 @contextmanager
 def running_service(
     command: list[str], environment: Mapping[str, str], kind: type[ServiceProcess] = ServiceProcess
 ) -> Iterator[ServiceProcess]:
     process = subprocess.Popen(
         command,
-        env={**os.environ, "GRASP_HOST": "127.0.0.1", "GRASP_PORT": "0", "GRASP_DEVICE": "cpu", **environment},
+        env={**os.environ, **SERVED_HERE, **environment},
         stdout=subprocess.PIPE,
         stderr=subprocess.PIPE,
         text=True,
@@ -89,11 +143,11 @@ def running_service(
         if process.poll() is None:
             process.terminate()
             try:
-                process.wait(30)
+                process.wait(PATIENCE_S)
             except subprocess.TimeoutExpired:
                 process.kill()
                 process.wait()
-        reader.join(10)
+        reader.join(PATIENCE_S)
         for stream in (process.stdout, process.stderr):
             if stream is not None:
                 stream.close()

@@ -22,6 +22,7 @@ from service.inference_protocol.tensors import OUTPUTS
 from service.settings import Settings
 from service.viewer import PAGE_PATHS
 from tesnet.result import Reason
+from tests.conftest import PATIENCE_S
 from tests.depth_scene import box_on_table
 
 ROOT = Path(__file__).resolve().parents[1]
@@ -192,6 +193,7 @@ def assert_is_part(shown: Any, real: Any, where: str = "$") -> None:
         assert type(shown) is type(real), where
 
 
+@pytest.mark.needs("curl")
 @pytest.mark.parametrize(("command", "shown"), re.findall(r"```sh\n(.*?)```\n+(?:```json\n(.*?)```)?", PAGE, re.DOTALL))
 def test_the_commands_answer_what_is_shown(command: str, shown: str, service_url: str, folder: Path) -> None:
     ended = subprocess.run(
@@ -199,7 +201,7 @@ def test_the_commands_answer_what_is_shown(command: str, shown: str, service_url
         cwd=folder,
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
         check=False,
     )
     assert ended.returncode == 0, ended.stderr

@@ -10,9 +10,11 @@ import sys
 from pathlib import Path
 
 import numpy as np
+import pytest
 
 from bench.scene import five_objects
 from service.schemas import GraspOptions
+from tests.conftest import PATIENCE_S
 
 ROOT = Path(__file__).resolve().parents[1]
 README = (ROOT / "README.md").read_text(encoding="utf-8")
@@ -28,11 +30,14 @@ def _snippet(language: str, containing: str) -> str:
 
 def _run(command: list[str]) -> str:
     environment = os.environ | {"PYTHONPATH": str(ROOT)}
-    done = subprocess.run(command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=60, check=False)
+    done = subprocess.run(
+        command, cwd=ROOT, env=environment, capture_output=True, text=True, timeout=PATIENCE_S, check=False
+    )
     assert done.returncode == 0, done.stderr
     return done.stdout
 
 
+@pytest.mark.needs("curl")
 def test_the_curl_command_returns_three_ranked_grasps(service_url: str) -> None:
     answer = json.loads(_run(["bash", "-c", _snippet("sh", "curl").replace(SHOWN_URL, service_url)]))
     scores = [grasp["score"] for grasp in answer["grasps"]]

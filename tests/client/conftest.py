@@ -18,6 +18,7 @@ import pytest
 from client import AsyncGraspClient, GraspClient
 from service import schemas
 from tesnet.geometry import Pose
+from tests.conftest import PATIENCE_S
 
 
 @dataclass(frozen=True)
@@ -134,17 +135,18 @@ Call = Callable[..., Any]
 
 @pytest.fixture(params=["sync", "async"])
 def call(request: pytest.FixtureRequest) -> Call:
-    """`call(url, method, *arguments, client={...}, **options)`: one method of either client, which is closed after."""
+    """`call(url, method, *arguments, client={...}, **options)`: one method of either client, patient unless told
+    otherwise, which is closed after."""
 
     def of_sync(url: str, method: str, *arguments: Any, client: Mapping[str, Any] | None = None, **options: Any) -> Any:
-        with GraspClient(url, **(client or {})) as opened:
+        with GraspClient(url, **{"timeout": PATIENCE_S, **(client or {})}) as opened:
             return getattr(opened, method)(*arguments, **options)
 
     def of_async(
         url: str, method: str, *arguments: Any, client: Mapping[str, Any] | None = None, **options: Any
     ) -> Any:
         async def go() -> Any:
-            async with AsyncGraspClient(url, **(client or {})) as opened:
+            async with AsyncGraspClient(url, **{"timeout": PATIENCE_S, **(client or {})}) as opened:
                 awaitable: Awaitable[Any] = getattr(opened, method)(*arguments, **options)
                 return await awaitable
 

@@ -17,6 +17,7 @@ from client.images import png
 from tests import depth_scene
 from tests.client.conftest import Call
 from tests.client.test_cloud_file import ply
+from tests.conftest import PATIENCE_S
 
 Points = np.ndarray[Any, np.dtype[np.float32]]
 ROOT = Path(__file__).resolve().parents[2]
@@ -55,16 +56,16 @@ def test_the_service_answers_what_the_client_reads(call: Call, service_url: str,
 
 def test_both_clients_get_the_same_answer(service_url: str, box_on_table: Points) -> None:
     async def ask() -> client.GraspReply:
-        async with client.AsyncGraspClient(service_url) as opened:
+        async with client.AsyncGraspClient(service_url, timeout=PATIENCE_S) as opened:
             return await opened.grasps(box_on_table, **QUERY)
 
-    with client.GraspClient(service_url) as opened:
+    with client.GraspClient(service_url, timeout=PATIENCE_S) as opened:
         reply = opened.grasps(box_on_table, **QUERY)
     np.testing.assert_array_equal(asyncio.run(ask()).poses, reply.poses)
 
 
 def test_health_and_model(call: Call, service_url: str) -> None:
-    call(service_url, "wait_until_ready", 60)
+    call(service_url, "wait_until_ready", PATIENCE_S)
     assert call(service_url, "live") is True
     assert call(service_url, "ready") is True
     model = call(service_url, "model")
@@ -97,10 +98,10 @@ def test_the_command_prints_the_same_grasps(tmp_path: Path, service_url: str, bo
     path.write_bytes(ply(box_on_table, text=False, byte_order="<"))
     camera = [str(coordinate) for coordinate in CAMERA]
     flags = ["--viewpoint", *camera, "--up", "0", "0", "1", "--support-height", "0", "--top-k", "5", "--json"]
-    command = [sys.executable, "-m", "client", str(path), "--url", service_url, *flags]
+    command = [sys.executable, "-m", "client", str(path), "--url", service_url, "--timeout", f"{PATIENCE_S:g}", *flags]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
-    with client.GraspClient(service_url) as opened:
+    with client.GraspClient(service_url, timeout=PATIENCE_S) as opened:
         expected = opened.grasps(box_on_table, **QUERY).to_dict()
     assert json.loads(done.stdout)["grasps"] == expected["grasps"]
 
@@ -165,7 +166,17 @@ def test_the_command_reads_a_depth_image(tmp_path: Path, service_url: str) -> No
         "max_width=0.07",
         "--json",
     ]
-    command = [sys.executable, "-m", "client", str(depth), "--url", service_url, *map(str, flags)]
+    command = [
+        sys.executable,
+        "-m",
+        "client",
+        str(depth),
+        "--url",
+        service_url,
+        "--timeout",
+        f"{PATIENCE_S:g}",
+        *map(str, flags),
+    ]
     done = subprocess.run(command, capture_output=True, text=True, cwd=ROOT, check=False)
     assert done.returncode == 0, done.stderr
     assert {grasp["width"] for grasp in json.loads(done.stdout)["grasps"]} == {0.07}

@@ -22,6 +22,7 @@ from service.settings import Settings
 from tesnet.geometry import GraspSet
 from tesnet.query import GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult
+from tests.conftest import PATIENCE_S
 
 Cloud = NDArray[np.float32]
 
@@ -45,7 +46,7 @@ def cloud() -> Cloud:
 @pytest.fixture(scope="session")
 def http(service_url: str) -> Iterator[httpx.Client]:
     """An HTTP client of the shared real service."""
-    with httpx.Client(base_url=service_url, timeout=120) as client:
+    with httpx.Client(base_url=service_url, timeout=PATIENCE_S) as client:
         yield client
 
 
@@ -75,7 +76,7 @@ class GatedPredictor:
     def _predict(self, query: GraspQuery) -> GraspResult:
         self.entered.release()
         self.seeds.append(query.seed)
-        assert self.gate.wait(60)
+        assert self.gate.wait(PATIENCE_S)
         if self.fault is not None:
             raise self.fault
         counts = GraspCounts(len(query.points), 0, 0, 0, 0, dict.fromkeys(REJECTIONS, 0))
@@ -109,29 +110,29 @@ def serve() -> Iterator[Callable[..., LocalServer]]:
     def start(protocol: type[PunctualProtocol] = PunctualProtocol, **settings: Any) -> LocalServer:
         predictor = GatedPredictor()
         ready = threading.Event()
-        app = create_app(Settings(**settings), lambda: predictor, on_ready=ready.set)
+        app = create_app(Settings(**{"request_timeout": PATIENCE_S, **settings}), lambda: predictor, on_ready=ready.set)
         listener = socket.create_server(("127.0.0.1", 0))
         server = uvicorn.Server(uvicorn.Config(app, http=protocol, log_config=None, access_log=False, ws="none"))
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         started.append((predictor, server, thread))
-        assert ready.wait(30)
+        assert ready.wait(PATIENCE_S)
         return LocalServer(f"http://127.0.0.1:{listener.getsockname()[1]}", predictor, app.state.endpoint)
 
     yield start
     for predictor, server, thread in started:
         predictor.gate.set()
         server.should_exit = True
-        thread.join(30)
+        thread.join(PATIENCE_S)
         assert not thread.is_alive()
 
 
 @pytest.fixture(scope="session")
 def eventually() -> Callable[[Callable[[], bool]], None]:
-    """Wait until a condition holds, for at most half a minute."""
+    """Wait until a condition holds."""
 
     def wait(condition: Callable[[], bool]) -> None:
-        deadline = time.monotonic() + 30
+        deadline = time.monotonic() + PATIENCE_S
         while not condition():
             assert time.monotonic() < deadline, "the condition never held"
             time.sleep(0.01)

@@ -15,6 +15,7 @@ from service import batching
 from service.batching import PredictionWorker
 from service.errors import DeadlineExceeded, NotReady, QueueFull
 from tesnet.query import GraspQuery
+from tests.conftest import PATIENCE_S
 
 
 class Echo:
@@ -33,7 +34,7 @@ class Echo:
 
     def predict_batch(self, queries: Sequence[GraspQuery]) -> list[Any]:
         self.entered.release()
-        assert self.gate.wait(30)
+        assert self.gate.wait(PATIENCE_S)
         if any(query.seed == 13 for query in queries):
             raise ValueError("unlucky")
         return [threading.current_thread() for _ in queries]
@@ -64,7 +65,7 @@ def start(made: list[Echo]) -> Iterator[StartWorker]:
         ready = threading.Event()
         workers.append(PredictionWorker(factory, on_ready=ready.set, **options))
         workers[0].start()
-        assert ready.wait(30)
+        assert ready.wait(PATIENCE_S)
         return workers[0]
 
     yield make
@@ -80,7 +81,7 @@ def worker(start: StartWorker) -> PredictionWorker:
 
 def test_one_thread_makes_and_uses_the_predictor(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:
     made[0].gate.set()
-    answers = [worker.submit(query).future.result(30) for _ in range(2)]
+    answers = [worker.submit(query).future.result(PATIENCE_S) for _ in range(2)]
     assert {id(answer.result) for answer in answers} == {id(made[0].made_in)}
     assert all(answer.queue_ms >= 0 for answer in answers)
 
@@ -89,7 +90,7 @@ def test_the_queue_is_bounded_and_cancelling_frees_a_place(
     worker: PredictionWorker, made: list[Echo], query: GraspQuery
 ) -> None:
     running = worker.submit(query)
-    assert made[0].entered.acquire(timeout=30)
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
     first, _ = worker.submit(query), worker.submit(query)
     with pytest.raises(QueueFull, match="limit 2") as refused:
         worker.submit(query)
@@ -101,9 +102,9 @@ def test_the_queue_is_bounded_and_cancelling_frees_a_place(
     assert worker.depth == 1
     worker.submit(query)
     made[0].gate.set()
-    assert running.future.result(30) is not None
+    assert running.future.result(PATIENCE_S) is not None
     with pytest.raises(CancelledError):
-        first.future.result(30)
+        first.future.result(PATIENCE_S)
 
 
 def test_a_query_that_fails_does_not_end_the_worker(
@@ -111,8 +112,8 @@ def test_a_query_that_fails_does_not_end_the_worker(
 ) -> None:
     made[0].gate.set()
     with pytest.raises(ValueError, match="unlucky"):
-        worker.submit(GraspQuery(query.points, seed=13)).future.result(30)
-    assert worker.submit(query).future.result(30) is not None
+        worker.submit(GraspQuery(query.points, seed=13)).future.result(PATIENCE_S)
+    assert worker.submit(query).future.result(PATIENCE_S) is not None
 
 
 def test_what_waits_is_predicted_together_up_to_the_limit(
@@ -121,10 +122,10 @@ def test_what_waits_is_predicted_together_up_to_the_limit(
     sizes: list[int] = []
     worker = start(capacity=8, max_batch=3, on_batch=sizes.append)
     first = worker.submit(query)
-    assert made[0].entered.acquire(timeout=30)
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
     others = [worker.submit(query) for _ in range(4)]
     made[0].gate.set()
-    answers = [job.future.result(30) for job in (first, *others)]
+    answers = [job.future.result(PATIENCE_S) for job in (first, *others)]
     assert [answer.batch_size for answer in answers] == [1, 3, 3, 3, 1]
     assert sizes == [1, 3, 1]
 
@@ -134,12 +135,12 @@ def test_a_fault_in_a_batch_is_told_to_its_own_query_alone(
 ) -> None:
     worker = start(capacity=8, max_batch=8)
     first = worker.submit(query)
-    assert made[0].entered.acquire(timeout=30)
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
     good, bad, late = worker.submit(query), worker.submit(GraspQuery(query.points, seed=13)), worker.submit(query)
     made[0].gate.set()
-    assert all(job.future.result(30) for job in (first, good, late))
+    assert all(job.future.result(PATIENCE_S) for job in (first, good, late))
     with pytest.raises(ValueError, match="unlucky"):
-        bad.future.result(30)
+        bad.future.result(PATIENCE_S)
 
 
 def test_a_query_whose_deadline_passed_is_never_predicted(
@@ -148,12 +149,12 @@ def test_a_query_whose_deadline_passed_is_never_predicted(
     sizes: list[int] = []
     worker = start(capacity=8, max_batch=8, on_batch=sizes.append)
     running = worker.submit(query)
-    assert made[0].entered.acquire(timeout=30)
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
     late = worker.submit(query, deadline=time.perf_counter() - 1)
     made[0].gate.set()
     with pytest.raises(DeadlineExceeded):
-        late.future.result(30)
-    assert running.future.result(30) is not None
+        late.future.result(PATIENCE_S)
+    assert running.future.result(PATIENCE_S) is not None
     assert sizes == [1]
 
 
@@ -161,7 +162,7 @@ def test_a_query_whose_turn_would_come_after_its_deadline_is_refused_at_once(
     worker: PredictionWorker, made: list[Echo], query: GraspQuery
 ) -> None:
     worker.submit(query)
-    assert made[0].entered.acquire(timeout=30)
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
     worker.submit(query)
     assert worker.expected_wait > 0
     with pytest.raises(QueueFull, match="X-Request-Timeout"):
@@ -188,7 +189,7 @@ class Timed:
 
     def predict_batch(self, queries: Sequence[GraspQuery]) -> list[Any]:
         self.entered.release()
-        assert self.gate.acquire(timeout=30)
+        assert self.gate.acquire(timeout=PATIENCE_S)
         self.now += sum(len(query.points) for query in queries) / 1000
         return [None for _ in queries]
 
@@ -204,14 +205,14 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Timed, PredictionWo
     monkeypatch.setattr(batching, "time", predictor)
     worker = PredictionWorker(lambda: predictor, capacity=8, on_ready=ready.set)
     worker.start()
-    assert ready.wait(30)
+    assert ready.wait(PATIENCE_S)
     for points in (4000, 1000):
         job = worker.submit(cloud_of(points))
         predictor.gate.release()
-        job.future.result(30)
-        assert predictor.entered.acquire(timeout=30)
+        job.future.result(PATIENCE_S)
+        assert predictor.entered.acquire(timeout=PATIENCE_S)
     worker.submit(cloud_of(1000))
-    assert predictor.entered.acquire(timeout=30)
+    assert predictor.entered.acquire(timeout=PATIENCE_S)
     yield predictor, worker
     for _ in range(8):
         predictor.gate.release()
@@ -274,15 +275,15 @@ def test_a_wrong_guess_at_a_querys_own_time_does_not_refuse_it_for_ever(timed: t
 
 def test_stopping_refuses_what_waits(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:
     running = worker.submit(query)
-    assert made[0].entered.acquire(timeout=30)
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
     waiting = worker.submit(query)
     stopping = threading.Thread(target=worker.stop)
     stopping.start()
     with pytest.raises(NotReady, match="repeat"):
-        waiting.future.result(30)
+        waiting.future.result(PATIENCE_S)
     made[0].gate.set()
-    assert running.future.result(30) is not None
-    stopping.join(30)
+    assert running.future.result(PATIENCE_S) is not None
+    stopping.join(PATIENCE_S)
     assert worker.stop()
     with pytest.raises(NotReady, match="stopped"):
         worker.submit(query)
@@ -303,7 +304,7 @@ def test_a_predictor_that_cannot_be_made_is_reported_and_nothing_is_taken(query:
     with pytest.raises(NotReady, match="loaded"):
         _ = worker.model
     worker.start()
-    assert failed.wait(30)
+    assert failed.wait(PATIENCE_S)
     assert worker.state == "failed"
     assert str(failures[0]) == "no weights"
     with pytest.raises(NotReady, match="failed"):

@@ -14,6 +14,7 @@ from numpy.typing import NDArray
 from tritonclient.utils import InferenceServerException
 
 from service.inference_protocol.tensors import HEADER_LENGTH, OUTPUTS
+from tests.conftest import PATIENCE_S
 
 Cloud = NDArray[np.float32]
 
@@ -24,7 +25,7 @@ ARRAYS = [output.name for output in OUTPUTS if output.name != "meta"]
 
 @pytest.fixture(scope="module")
 def client(service_url: str) -> Iterator[triton.InferenceServerClient]:
-    with triton.InferenceServerClient(service_url.removeprefix("http://"), network_timeout=120) as client:
+    with triton.InferenceServerClient(service_url.removeprefix("http://"), network_timeout=PATIENCE_S) as client:
         yield client
 
 
@@ -208,7 +209,7 @@ def test_options_in_the_query_string_are_refused(http: httpx.Client) -> None:
 
 def test_tritons_timeout_is_how_long_a_request_may_wait(client: triton.InferenceServerClient, cloud: Cloud) -> None:
     points = [tensor(cloud, binary=True)]
-    assert client.infer("tesnet", points, timeout=60_000_000).as_numpy("scores") is not None
+    assert client.infer("tesnet", points, timeout=3600_000_000).as_numpy("scores") is not None
     with pytest.raises(InferenceServerException, match="deadline") as late:
         client.infer("tesnet", points, timeout=1)
     assert late.value.status() == "504"

@@ -8,6 +8,7 @@ from typing import Any
 
 import httpx
 
+from tests.conftest import PATIENCE_S
 from tests.service.wire import OCTETS, post, post_head, problem_of
 
 Serve = Callable[..., Any]
@@ -22,7 +23,7 @@ def test_too_many_bytes_at_once_are_a_429_and_are_forgotten(serve: Serve, eventu
     uploads = [post_head(server.url, length=2**20) for _ in range(5)]
     for upload in uploads:
         upload.sendall(bytes(2**20 - 1))
-    refused = select.select(uploads, [], [], 30)[0][0]  # whichever's bytes came last
+    refused = select.select(uploads, [], [], PATIENCE_S)[0][0]  # whichever's bytes came last
     assert refused.recv(4096).startswith(b"HTTP/1.1 429 ")
     for upload in uploads:
         upload.close()

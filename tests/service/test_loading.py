@@ -11,6 +11,7 @@ import pytest
 from service.loading import predictor_factory
 from service.settings import Settings
 from tesnet.errors import WeightsError
+from tests.conftest import PATIENCE_S
 
 
 def test_the_network_and_torch_are_loaded_when_the_factory_is_called_and_not_before() -> None:
@@ -19,7 +20,7 @@ def test_the_network_and_torch_are_loaded_when_the_factory_is_called_and_not_bef
         "make = predictor_factory(Settings(device='cpu', num_threads=1)); assert 'torch' not in sys.modules; "
         "print(make().model.name)"
     )
-    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=120, check=True)
+    ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     assert ran.stdout.strip() == "tesnet"
 
 

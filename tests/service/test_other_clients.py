@@ -11,6 +11,8 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from tests.conftest import PATIENCE_S
+
 QUERY = "viewpoint=[0.35,0,0.5]&up=[0,0,1]&max_candidates=200&max_grasps=3&frame_convention=panda"
 
 NODE = """
@@ -41,10 +43,11 @@ def cloud_file(cloud: NDArray[np.float32], tmp_path: Path) -> Path:
 
 
 def curl(*arguments: str) -> str:
-    command = ["curl", "--silent", "--show-error", "--max-time", "60", *arguments]
+    command = ["curl", "--silent", "--show-error", "--max-time", f"{PATIENCE_S:g}", *arguments]
     return subprocess.run(command, capture_output=True, text=True, check=True).stdout
 
 
+@pytest.mark.needs("curl")
 def test_curl_posts_a_file(service_url: str, cloud_file: Path) -> None:
     answer: dict[str, Any] = json.loads(
         curl(
@@ -59,12 +62,14 @@ def test_curl_posts_a_file(service_url: str, cloud_file: Path) -> None:
     assert len(answer["grasps"]) == answer["counts"]["returned"] > 0
 
 
+@pytest.mark.needs("curl")
 def test_curl_posts_json_from_a_shell(service_url: str) -> None:
     body = '{"points": [[0, 0, 0.5], [0.01, 0, 0.5]], "up": [0, 0, 1]}'
     answer = json.loads(curl("--json", body, f"{service_url}/grasps"))
     assert answer["reason"] == "too_few_points"
 
 
+@pytest.mark.needs("curl")
 def test_curl_reads_the_413_of_a_stream_that_is_too_large(service_url: str, tmp_path: Path) -> None:
     large = tmp_path / "large.f32"
     with large.open("wb") as file:
@@ -74,9 +79,14 @@ def test_curl_reads_the_413_of_a_stream_that_is_too_large(service_url: str, tmp_
     assert answer["status"] == 413
 
 
+@pytest.mark.needs("node")
 def test_node_posts_both_kinds_of_body_and_reads_a_problem(service_url: str, cloud_file: Path) -> None:
     ended = subprocess.run(
-        ["node", "--eval", NODE, service_url, str(cloud_file)], capture_output=True, text=True, check=True, timeout=60
+        ["node", "--eval", NODE, service_url, str(cloud_file)],
+        capture_output=True,
+        text=True,
+        check=True,
+        timeout=PATIENCE_S,
     )
     answers = json.loads(ended.stdout)
     assert answers["octets"]["status"] == answers["json"]["status"] == 200

@@ -18,7 +18,7 @@ import numpy as np
 import pytest
 
 from tesnet.weights import SUMS, default_weights
-from tests.conftest import hears
+from tests.conftest import PATIENCE_S, SERVED_HERE, hears
 
 StartService = Callable[..., Any]
 
@@ -29,10 +29,10 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
     """A service that is expected to end by itself."""
     return subprocess.run(
         [sys.executable, "-m", "service", *arguments],
-        env={**os.environ, "GRASP_HOST": "127.0.0.1", "GRASP_PORT": "0", "GRASP_DEVICE": "cpu", **environment},
+        env={**os.environ, **SERVED_HERE, **environment},
         capture_output=True,
         text=True,
-        timeout=300,
+        timeout=PATIENCE_S,
         check=False,
     )
 
@@ -40,7 +40,7 @@ def run(*arguments: str, **environment: str) -> subprocess.CompletedProcess[str]
 def half_a_request(url: str) -> socket.socket:
     """A connection on which a request was begun that the service now waits for."""
     parts = urllib.parse.urlsplit(url)
-    connection = socket.create_connection((parts.hostname or "", parts.port or 0), timeout=60)
+    connection = socket.create_connection((parts.hostname or "", parts.port or 0), timeout=PATIENCE_S)
     connection.sendall(
         f"POST /grasps HTTP/1.1\r\nHost: test\r\nContent-Type: application/octet-stream\r\n"
         f"Content-Length: {len(POINTS)}\r\nExpect: 100-continue\r\n\r\n".encode()
@@ -61,7 +61,7 @@ def test_sigterm_refuses_what_is_new_finishes_what_was_taken_and_exits_with_0(st
             assert (refused.status_code, refused.headers["Retry-After"]) == (503, "1")
             connection.sendall(POINTS)
             assert connection.recv(4096).startswith(b"HTTP/1.1 200 ")
-        assert service.process.wait(30) == 0
+        assert service.process.wait(PATIENCE_S) == 0
         service.wait_for("stopped")
         assert service.process.stderr.read() == ""
 
@@ -73,7 +73,7 @@ def test_a_second_sigterm_ends_at_once(start_service: StartService) -> None:
             service.process.send_signal(signal.SIGTERM)
             service.wait_for("draining")
             service.process.send_signal(signal.SIGTERM)
-            assert service.process.wait(30) == 128 + signal.SIGTERM
+            assert service.process.wait(PATIENCE_S) == 128 + signal.SIGTERM
         assert not any(line["event"] == "stopped" for line in service.lines)
 
 
@@ -83,7 +83,7 @@ def test_the_drain_timeout_ends_a_request_that_never_ends(start_service: StartSe
         with half_a_request(service.url) as connection:
             service.process.send_signal(signal.SIGINT)
             assert connection.recv(4096).startswith(b"HTTP/1.1 503 ")
-            assert service.process.wait(60) == 0
+            assert service.process.wait(PATIENCE_S) == 0
         service.wait_for("request", status=503)
 
 
@@ -93,7 +93,7 @@ def test_sigterm_before_the_port_is_open_exits_with_0(start_service: StartServic
             assert service.process.poll() is None
             time.sleep(0.001)
         service.process.send_signal(signal.SIGTERM)
-        assert service.process.wait(30) == 0
+        assert service.process.wait(PATIENCE_S) == 0
     assert service.lines == []
 
 

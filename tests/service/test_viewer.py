@@ -5,7 +5,6 @@ from __future__ import annotations
 import html
 import json
 import re
-import shutil
 import subprocess
 from collections.abc import Callable
 from io import BytesIO
@@ -19,18 +18,17 @@ from numpy.typing import NDArray
 from PIL import Image
 
 from service.viewer import ADDRESS, PAGE_PATHS
+from tests.conftest import PATIENCE_S
 from tests.depth_scene import box_on_table
 
 FOLDER = Path(__file__).resolve().parents[2] / "service" / "viewer"
-BROWSER = "chromium"
 
 
 def browse(url: str, *arguments: str) -> str:
     """What a browser without a window says of a page once its script has nothing left to do."""
-    assert shutil.which(BROWSER), f"{BROWSER} is missing: apt-get install {BROWSER}"
     drawing = ["--use-angle=swiftshader", "--enable-unsafe-swiftshader", "--window-size=1400,850"]
-    command = [BROWSER, "--headless=new", "--no-sandbox", *drawing, "--virtual-time-budget=60000", *arguments, url]
-    return subprocess.run(command, capture_output=True, text=True, timeout=240, check=True).stdout
+    command = ["chromium", "--headless=new", "--no-sandbox", *drawing, "--virtual-time-budget=60000", *arguments, url]
+    return subprocess.run(command, capture_output=True, text=True, timeout=PATIENCE_S, check=True).stdout
 
 
 def test_the_page_is_made_of_what_the_service_itself_sends(http: httpx.Client) -> None:
@@ -79,11 +77,12 @@ def test_points_are_refused_like_those_for_grasps(http: httpx.Client, serve: Cal
     assert server.endpoint.active == 0
 
 
+@pytest.mark.needs("chromium")
 def test_a_browser_lists_and_draws_the_grasps_of_the_example(service_url: str, tmp_path: Path) -> None:
     query = "viewpoint=[0.38,0.55,0.48]&up=[0,0,1]&support_height=0.05&max_grasps=10"
     body = (FOLDER / "example.npy").read_bytes()
     answer = httpx.post(
-        f"{service_url}/grasps?{query}", content=body, headers={"Content-Type": "application/x-npy"}, timeout=60
+        f"{service_url}/grasps?{query}", content=body, headers={"Content-Type": "application/x-npy"}, timeout=PATIENCE_S
     ).json()
     picture = tmp_path / "page.png"
     page = browse(f"{service_url}{ADDRESS}?example", "--dump-dom", f"--screenshot={picture}")

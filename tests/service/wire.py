@@ -13,6 +13,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.schemas import Problem
+from tests.conftest import PATIENCE_S
 
 OCTETS = {"Content-Type": "application/octet-stream"}
 POINTS = np.zeros((20, 3), np.float32).tobytes()
@@ -22,13 +23,13 @@ POINTS = np.zeros((20, 3), np.float32).tobytes()
 def post(url: str, seed: int = 0, **headers: str) -> httpx.Response:
     """The answer to a cloud of 20 points; `X_Request_Timeout="1"` is a header."""
     renamed = {name.replace("_", "-"): value for name, value in headers.items()}
-    return httpx.post(f"{url}/grasps?seed={seed}", content=POINTS, headers={**OCTETS, **renamed}, timeout=60)
+    return httpx.post(f"{url}/grasps?seed={seed}", content=POINTS, headers={**OCTETS, **renamed}, timeout=PATIENCE_S)
 
 
 def connect(url: str) -> socket.socket:
     """A connection on which nothing was sent."""
     parts = urllib.parse.urlsplit(url)
-    return socket.create_connection((parts.hostname or "", parts.port or 0), timeout=60)
+    return socket.create_connection((parts.hostname or "", parts.port or 0), timeout=PATIENCE_S)
 
 
 def post_head(url: str, path: str = "/grasps", length: int = len(POINTS), headers: str | None = None) -> socket.socket:

@@ -1,10 +1,10 @@
 from __future__ import annotations
 
+import importlib
 import math
 from typing import Any
 
 import numpy as np
-import open3d
 import pytest
 import torch
 from hypothesis import given, settings
@@ -32,8 +32,12 @@ from tests.tesnet.scenes import (
 FEW = settings(max_examples=15, deadline=None)
 
 
+def open3d() -> Any:
+    return importlib.import_module("open3d")  # not at the top: it needs system libraries
+
+
 def in_open3d(points: Tensor) -> Any:
-    return open3d.geometry.PointCloud(open3d.utility.Vector3dVector(points.double().numpy()))
+    return open3d().geometry.PointCloud(open3d().utility.Vector3dVector(points.double().numpy()))
 
 
 def sorted_rows(points: Array) -> Array:
@@ -48,6 +52,7 @@ def uniform(count: int, seed: int, extent: float = 0.1) -> Tensor:
 # Against Open3D and SciPy
 
 
+@pytest.mark.needs("open3d")
 @given(count=st.sampled_from([1, 2, 50, 3000]), seed=st.integers(0, 999), voxel=st.sampled_from([0.003, 0.0045, 0.05]))
 @FEW
 def test_the_voxel_grid_is_open3ds(count: int, seed: int, voxel: float) -> None:
@@ -68,6 +73,7 @@ def test_voxels_come_in_a_fixed_order_without_duplicates() -> None:
     assert len(first.unique(dim=0)) == len(first)
 
 
+@pytest.mark.needs("open3d")
 @pytest.mark.parametrize(("neighbours", "ratio"), [(10, 1.0), (21, 2.0), (21, 3.0)])
 def test_statistical_outliers_are_open3ds(neighbours: int, ratio: float) -> None:
     points = torch.cat([uniform(1500, 1), uniform(40, 2, extent=0.4)])
@@ -136,12 +142,13 @@ def test_neighbours_after_dropping_points_are_those_of_a_fresh_search(seed: int,
     assert torch.equal(neighbours[:, 0], fresh[:, 0])
 
 
+@pytest.mark.needs("open3d")
 @pytest.mark.parametrize("seed", range(3))
 def test_normals_are_open3ds_up_to_sign(seed: int) -> None:
     points = cloud.voxel_downsample(torch.from_numpy(tabletop(seed)).float(), 0.0045)
     normals, _ = cloud.estimate_normals(points, cloud.nearest_neighbours(points, 30), 0.03)
     reference = in_open3d(points)
-    reference.estimate_normals(open3d.geometry.KDTreeSearchParamHybrid(radius=0.03, max_nn=30))
+    reference.estimate_normals(open3d().geometry.KDTreeSearchParamHybrid(radius=0.03, max_nn=30))
     cosines = np.abs((normals.double().numpy() * np.asarray(reference.normals)).sum(axis=1))
     # Where two eigenvalues nearly agree the normal is not defined; that is hardly anywhere.
     assert (cosines > 0.9999).mean() > 0.995

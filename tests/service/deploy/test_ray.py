@@ -24,7 +24,7 @@ from service.errors import PROBLEM_JSON
 from service.schemas import REQUEST_ID
 from service.settings import Settings
 from tesnet.errors import TesnetError
-from tests.conftest import hears, running_service
+from tests.conftest import PATIENCE_S, hears, running_service
 
 
 def test_a_replica_has_started_when_its_network_is_warm() -> None:
@@ -90,7 +90,7 @@ def test_a_cluster_that_would_obey_everybody_is_not_started() -> None:
         env={**os.environ, "RAY_AUTH_MODE": "disabled"},
         capture_output=True,
         text=True,
-        timeout=120,
+        timeout=PATIENCE_S,
         check=False,
     )
     assert ended.returncode == 2
@@ -104,7 +104,7 @@ def test_sigterm_before_ray_is_loaded_ends_the_command_with_0() -> None:
             assert command.process.poll() is None
             time.sleep(0.001)
         command.process.terminate()
-        assert command.process.wait(30) == 0
+        assert command.process.wait(PATIENCE_S) == 0
 
 
 @pytest.mark.filterwarnings("ignore:Using extra keyword arguments on `Field`")  # Ray does, where it is loaded
@@ -125,7 +125,7 @@ def test_a_replica_without_weights_does_not_start(tmp_path: Path) -> None:
 
 def test_the_command_says_what_it_cannot_use_before_it_starts_a_cluster() -> None:
     command = [sys.executable, "-m", "service.deploy.ray"]
-    helped = subprocess.run([*command, "--help"], capture_output=True, text=True, timeout=60, check=True)
+    helped = subprocess.run([*command, "--help"], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     for option in (
         "--min-replicas",
         "--max-replicas",
@@ -137,7 +137,7 @@ def test_the_command_says_what_it_cannot_use_before_it_starts_a_cluster() -> Non
     ):
         assert option in helped.stdout
     for arguments, words in ((["--cpus", "0"], "--cpus is 0.0"), (["--address", "nowhere"], "--address is 'nowhere'")):
-        ended = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=120, check=False)
+        ended = subprocess.run([*command, *arguments], capture_output=True, text=True, timeout=PATIENCE_S, check=False)
         assert ended.returncode == 2
         assert words in ended.stderr
         assert "Traceback" not in ended.stderr
