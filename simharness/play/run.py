@@ -135,8 +135,8 @@ class _Log:
     def take(self, message: RoundRecord | Picture | Observed | Attempted) -> None:
         """What a worker said: a finished round, or something on the way to one."""
         if isinstance(message, RoundRecord):
+            self._done[message.seed, message.round] = message  # first: `close` writes it where Ctrl-C comes between
             self._folder.append(message)
-            self._done[message.seed, message.round] = message
             self._hooks.round_done(message)
         elif isinstance(message, Picture):
             self._folder.add_picture(message.name, message.content)
