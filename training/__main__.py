@@ -11,6 +11,8 @@ from typing import get_args
 
 from simharness.errors import SimError
 from simharness.sim.camera import Preset
+from tesnet import networks
+from tesnet.cloud import PreparationConfig
 from tesnet.errors import TesnetError
 from training.archive import is_archive, pack, unpack
 from training.evaluate import evaluate
@@ -108,6 +110,11 @@ def _add_unpack(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--archive", type=Path, required=True)
     parser.add_argument("--objects", required=True, help="the sets that hold its objects, joined with commas")
     parser.add_argument("--workers", type=_positive, default=1)
+    parser.add_argument("--scenes", type=_positive, metavar="N", help="so many, drawn from the whole archive")
+    parser.add_argument("--seed", type=int, default=0, help="of that draw")
+    parser.add_argument(
+        "--model", default="tesnet", choices=networks.NETWORKS, help="prepare the clouds as this network wants them"
+    )
     parser.add_argument("--out", type=Path, required=True, help="folder for the scenes; what is there stays")
     _add_more_views(parser)
     parser.set_defaults(run=_unpack)
@@ -124,11 +131,24 @@ def _add_more_views(parser: argparse.ArgumentParser) -> None:
 
 
 def _unpack(options: argparse.Namespace) -> dict[str, object]:
-    return unpack(options.archive, options.objects, options.out, options.workers, options.more_views)
+    return unpack(
+        options.archive,
+        options.objects,
+        options.out,
+        options.workers,
+        options.more_views,
+        scenes=options.scenes,
+        seed=options.seed,
+        preparation=_preparation_of(options.model),
+    )
+
+
+def _preparation_of(model: str) -> PreparationConfig:
+    return networks.NETWORKS[model][0].preparation
 
 
 def _add_fit(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--model", default="tesnet")
+    parser.add_argument("--model", default="tesnet", choices=networks.NETWORKS)
     parser.add_argument(
         "--data", type=Path, nargs="+", required=True, help="folders of labelled training scenes, or archives"
     )
@@ -168,7 +188,8 @@ def _rendered(archive: Path, options: argparse.Namespace) -> Path:
     if options.objects is None:
         raise LabelsError(f"{archive} is an archive, whose clouds are rendered again; name its objects with --objects")
     folder: Path = options.out.parent / f"{archive.name}-rendered"
-    unpack(archive, options.objects, folder, options.threads, options.more_views)
+    preparation = _preparation_of(options.model)
+    unpack(archive, options.objects, folder, options.threads, options.more_views, preparation=preparation)
     return folder
 
 

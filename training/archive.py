@@ -6,6 +6,7 @@ a scene is found by counts. Positions are kept to 0.02 mm, in the world.
 
 from __future__ import annotations
 
+import itertools
 import json
 import os
 from collections.abc import Iterator, Mapping, Sequence
@@ -31,7 +32,15 @@ from tesnet.cloud import nearest_neighbours
 from tesnet.geometry import Pose
 from tesnet.whole_file import whole_file
 from training.generate import is_free, observed_query
-from training.views import LabelledView, LabelsError, count_outcomes, load_scene, save_scene, scene_files
+from training.views import (
+    LabelledView,
+    LabelsError,
+    check_preparation,
+    count_outcomes,
+    load_scene,
+    save_scene,
+    scene_files,
+)
 
 RESOLUTION = 2e-5
 """Metres to which positions are kept."""
@@ -39,6 +48,7 @@ RESOLUTION = 2e-5
 LARGEST_SHIFT = 0.006
 """Candidates whose points have no point of the new cloud within so many metres are left out."""
 
+_TODAY = cloud.PreparationConfig()
 _DOWN = np.array([0.0, 0.0, -1.0])
 _STRAIGHT = 1 - 1e-6
 """Cosine of the angle with straight down, 0.08 degrees, up to which a direction of travel is kept as a mere flag: that
@@ -89,7 +99,17 @@ def pack(folders: Sequence[Path], out: Path) -> dict[str, Any]:
     }
 
 
-def unpack(archive: Path, objects: str, out: Path, workers: int = 1, more_views: int = 0) -> dict[str, Any]:
+def unpack(
+    archive: Path,
+    objects: str,
+    out: Path,
+    workers: int = 1,
+    more_views: int = 0,
+    *,
+    scenes: int | None = None,
+    seed: int = 0,
+    preparation: cloud.PreparationConfig = _TODAY,
+) -> dict[str, Any]:
     """Renders the scenes of an archive again, with noise of their own, as scene files in `out`.
 
     Scenes already there are left alone, so that a stopped run goes on.
@@ -101,24 +121,32 @@ def unpack(archive: Path, objects: str, out: Path, workers: int = 1, more_views:
         workers: processes.
         more_views: views of each scene from new cameras. The outcome of a grasp depends on no camera, so such a view
             shows all labels of its scene whose points it sees.
+        scenes: so many, drawn from the whole archive; None for all. Each keeps the number that it has in the archive.
+        seed: of the draw.
+        preparation: of the clouds. The noise does not depend on it.
 
     Raises:
-        LabelsError: no archive, or objects that the sets do not hold.
+        LabelsError: no archive, objects that the sets do not hold, or scenes of another preparation in `out`.
         SimError: a worker failed.
     """
     parts = sorted(archive.glob("labels_*.npz"))
     if not parts:
         raise LabelsError(f"{archive} holds no labels_*.npz; make one with `python -m training pack`")
     out.mkdir(parents=True, exist_ok=True)
+    if there := next(iter(sorted(out.glob("scene_*.npz"))), None):
+        check_preparation(there, load_scene(there)[0], preparation)
+    chosen = _draw(parts, scenes, seed)
     known = {kind: set(models) for kind, models in _models_by_kind(objects).items()}
-    number = waiting = 0
-    with crew(_Renderer(objects, more_views), workers, ray=None) as renderers, tqdm(unit="scene") as progress:
+    numbers, waiting = itertools.count(), 0
+    renderer = _Renderer(objects, more_views, preparation)
+    with crew(renderer, workers, ray=None) as renderers, tqdm(unit="scene") as progress:
         for part in parts:
-            for description, views in _read_part(part):
+            for (description, views), number in zip(_read_part(part), numbers, strict=False):
+                if not chosen[number]:
+                    continue
                 if missing := sorted({item["name"] for item in description["objects"]} - known[description["kind"]]):
                     raise LabelsError(f"--objects lacks {missing[0]}, which a scene of the archive holds; add its set")
                 path = out / f"scene_{number:07d}.npz"
-                number += 1
                 if not path.exists():
                     renderers.give(_Rendering(description, views, path))
                     waiting += 1
@@ -126,7 +154,18 @@ def unpack(archive: Path, objects: str, out: Path, workers: int = 1, more_views:
                 done = len(renderers.hear(_HEAR_S))
                 waiting -= done
                 progress.update(done)
-    return {"scenes": number}
+    return {"scenes": int(chosen.sum())}
+
+
+def _draw(parts: Sequence[Path], count: int | None, seed: int) -> NDArray[np.bool_]:
+    """Mask over the scenes of an archive's parts: `count` of them drawn at random, or all."""
+    total = 0
+    for part in parts:
+        with np.load(part, allow_pickle=False) as stored:
+            total += len(stored["scene_kind"])
+    chosen = np.zeros(total, dtype=np.bool_)
+    chosen[np.random.default_rng(seed).permutation(total)[:count]] = True
+    return chosen
 
 
 def _read_scene(path: Path) -> tuple[dict[str, Any], list[ArchivedView]]:
@@ -284,6 +323,7 @@ class _Renderer:
 
     objects: str
     more_views: int
+    preparation: cloud.PreparationConfig
 
     def name(self, job: _Rendering) -> str:
         """A scene in words."""
@@ -297,7 +337,7 @@ class _Renderer:
         models = _models_by_kind(self.objects)
 
         def render(job: _Rendering, _: Emit) -> None:
-            _render_scene(job, models[job.description["kind"]], self.more_views)
+            _render_scene(job, models[job.description["kind"]], self.more_views, self.preparation)
 
         yield render
 
@@ -309,17 +349,21 @@ def _models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
     }
 
 
-def _render_scene(job: _Rendering, models: Mapping[str, ObjectModel], more_views: int) -> None:
+def _render_scene(
+    job: _Rendering, models: Mapping[str, ObjectModel], more_views: int, preparation: cloud.PreparationConfig
+) -> None:
     rng = np.random.default_rng([len(job.views), *(len(view.outcomes) for view in job.views)])
     views = list(job.views)
     with World() as world:
         restore_scene(world, job.description, models)
-        rendered = [_render_view(world, view, job.description["kind"], rng) for view in views]
+        kind = job.description["kind"]
+        rendered = [_render_view(world, view, kind, rng, preparation) for view in views]
         for _ in range(more_views if views else 0):
             views.append(_from_elsewhere(job.views, rng))
-            rendered.append(_render_view(world, views[-1], job.description["kind"], rng))
+            rendered.append(_render_view(world, views[-1], kind, rng, preparation))
     cameras = [view.Ts_world_camera.tolist() for view in views]
-    save_scene(job.path, {**job.description, "cameras": cameras}, [view for view in rendered if view is not None])
+    description = {**job.description, "cameras": cameras}
+    save_scene(job.path, description, [view for view in rendered if view is not None], preparation)
 
 
 def _from_elsewhere(views: Sequence[ArchivedView], rng: np.random.Generator) -> ArchivedView:
@@ -332,11 +376,13 @@ def _from_elsewhere(views: Sequence[ArchivedView], rng: np.random.Generator) -> 
     )
 
 
-def _render_view(world: World, view: ArchivedView, kind: str, rng: np.random.Generator) -> LabelledView | None:
+def _render_view(
+    world: World, view: ArchivedView, kind: str, rng: np.random.Generator, preparation: cloud.PreparationConfig
+) -> LabelledView | None:
     preset: Preset = "random" if len(view.Ts_world_camera) == 1 else "multi3"
     cameras = [Pose.from_matrix(matrix) for matrix in view.Ts_world_camera]
     observation = observe_from(world, cameras, rng, PRESET_NOISE[preset])
-    prepared = cloud.prepare(observed_query(observation), cloud.PreparationConfig(), torch.device("cpu"))
+    prepared = cloud.prepare(observed_query(observation), preparation, torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     pairs = torch.tensor(_moved(prepared.T_cloud_canonical.inverse(), view.pairs)).float()

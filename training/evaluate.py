@@ -10,6 +10,7 @@ import numpy as np
 import torch
 
 from tesnet import networks, weights
+from tesnet.cloud import PreparationConfig
 from tesnet.networks import Network
 from training import metrics
 from training.views import LabelledView, LabelsError, load_views
@@ -27,7 +28,7 @@ def evaluate(name: str, path: Path | None, data: Sequence[Path], seed: int = 0) 
     """
     path = path or weights.default_weights(name)
     network, header = networks.load(path)
-    views = list(load_views(data))
+    views = list(load_views(data, PreparationConfig(**header.configuration["preparation"])))
     groups = {"all": views} | {
         scene: [view for view in views if view.scene == scene] for scene in sorted({view.scene for view in views})
     }
@@ -42,6 +43,16 @@ def evaluate(name: str, path: Path | None, data: Sequence[Path], seed: int = 0) 
     if not all(bool(view.collision_free.all()) for view in views):
         result["with_blocked"] = measures(blocked=True)
     return result
+
+
+def validate(network: Network, views: Sequence[LabelledView], seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Measures on the candidates that the observed cloud leaves free, which fit the calibration, and on all."""
+    scored = score_views(network, views, blocked=True)
+    shown = [view for view in views if len(view.outcomes)]
+    masks = [view.collision_free.numpy() for view in shown]
+    free = [(logits[mask], success[mask]) for (logits, success), mask in zip(scored, masks, strict=True) if mask.any()]
+    of_free = measure(free, seed)
+    return of_free, measure(scored, seed, tuple(of_free["calibration"]))
 
 
 @torch.inference_mode()

@@ -23,7 +23,7 @@ from tesnet.predictor import configuration_of
 from tesnet.whole_file import write_whole
 from training import metrics
 from training.augment import augment
-from training.evaluate import measure, score_views
+from training.evaluate import validate
 from training.views import LabelledView, LabelsError, load_views, scene_files
 
 
@@ -43,6 +43,7 @@ class Recipe:
         candidates_per_view: at most so many of a view's candidates in an epoch.
         blocked_per_view: at most so many more that collide with the observed cloud; the service never scores such, but
             their labels, too, tell what a hand hits.
+        keep: weights of the epoch with the least validation loss, or of the last one.
     """
 
     optimiser: Literal["adam", "adamw"] = "adamw"
@@ -55,12 +56,16 @@ class Recipe:
     views_per_step: int = 4
     candidates_per_view: int = 120
     blocked_per_view: int = 60
+    keep: Literal["best", "last"] = "best"
 
 
 PRESETS = {
     "default": Recipe(),
     # For weights that are good already (`start`), on many more views than they saw.
     "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=3),
+    # The same for every network of a comparison. The last epoch is kept: choosing the best one would favour those whose
+    # validation loss jumps about.
+    "comparison": Recipe(learning_rate=1e-3, max_epochs=8, views_per_step=2, blocked_per_view=80, keep="last"),
     # Section 5.1: Adam, the rate halved after 6 stagnant epochs; the rate itself is Edge Grasp Network's.
     "paper": Recipe(
         optimiser="adam", learning_rate=1e-4, weight_decay=0.0, patience=6, smallest_learning_rate=1e-6,
@@ -69,9 +74,28 @@ PRESETS = {
 }  # fmt: skip
 
 
+APPROACH_POINTS_PER_STEP = dict.fromkeys(("edgegrasp", "gatv2", "tesnet-paper", "tesnet-euclidean"), 16)
+"""Networks that work around each approach point, and of how many of a view's they see the candidates in a step: on one
+CPU core a step with all of them, 70 on average, would take several times as long as one of the other networks."""
+
+CHECKPOINT_S = 180.0
+"""Seconds between checkpoints within an epoch."""
+
+
 @dataclass(slots=True)
 class _Progress:
-    """What a checkpoint holds beside the tensors."""
+    """What a checkpoint holds beside the tensors.
+
+    Args:
+        recipe, seed: of the run.
+        learning_rate: now.
+        epoch: epochs done.
+        best_loss: least validation loss of them.
+        stagnant: epochs since then.
+        step: steps done in the next epoch.
+        loss: sum of the losses of its views so far.
+        seconds: that it has taken.
+    """
 
     recipe: dict[str, Any]
     seed: int
@@ -79,6 +103,9 @@ class _Progress:
     epoch: int = 0
     best_loss: float = math.inf
     stagnant: int = 0
+    step: int = 0
+    loss: float = 0.0
+    seconds: float = 0.0
 
 
 def fit(
@@ -94,13 +121,13 @@ def fit(
     version: str = "0",
     start: Path | None = None,
 ) -> dict[str, Any]:
-    """Trains network `name`, writes its best weights to `out` and returns its validation measures.
+    """Trains network `name`, writes its weights to `out` and returns its validation measures.
 
     Most candidates that the network is asked about are free of collision with the observed cloud, as in the service.
     Its logit is the log likelihood ratio of success, the log odds at a balanced prior: in the loss the log odds of the
     share of successes among all labels are added to it (logit adjustment, arXiv 2007.07314). Which kind of candidate is
-    shown more often does not bend it; which was labelled more often does. After every epoch a checkpoint beside `out`
-    lets a stopped run go on.
+    shown more often does not bend it; which was labelled more often does. Checkpoints beside `out`, after every epoch
+    and every few minutes within one, let a stopped run go on as if it had not been stopped.
 
     Args:
         name: of the network.
@@ -115,22 +142,24 @@ def fit(
         start: weights to begin with, also older ones with fewer inputs; None for random ones.
 
     Raises:
-        LabelsError: folders without usable labels, a checkpoint of another recipe or seed, or `start` of another
-            network.
+        LabelsError: folders without usable labels or with clouds of another preparation, a checkpoint of another recipe
+            or seed, `start` of another network, or a network without parameters.
         WeightsError: `start` cannot be read.
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    train_views = [view for view in load_views(data) if metrics.usable(view.success.numpy())]
+    network = networks.build(name)
+    if not list(network.parameters()):
+        raise LabelsError(f"{name} has no parameters to train; choose another network")
+    train_views = [view for view in load_views(data, network.preparation) if metrics.usable(view.success.numpy())]
     if not train_views:
         raise LabelsError(
             f"no view of the training labels has {metrics.FEWEST_POSITIVES} successes and a failure; "
             "generate more labels, or with more labels per view"
         )
-    validation_views = list(load_views(validation))
+    validation_views = list(load_views(validation, network.preparation))
     labels = sum(len(view.outcomes) for view in train_views)
     prior = sum(int(view.success.sum()) for view in train_views) / labels
-    network = networks.build(name)
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
     if start is not None:
@@ -138,25 +167,28 @@ def fit(
     progress = _resume(checkpoint, network, optimiser) or _Progress(asdict(recipe), seed, recipe.learning_rate)
     if (progress.recipe, progress.seed) != (asdict(recipe), seed):
         raise LabelsError(f"{checkpoint} is of another recipe or seed; use the same ones, or another --out")
+    approach_points = APPROACH_POINTS_PER_STEP.get(name)
     last_epoch = min(recipe.max_epochs, epochs or recipe.max_epochs)
     # Only halving ends the training: along the cosine the rate is small at the start, too.
     while progress.epoch < last_epoch and (recipe.cosine or progress.learning_rate >= recipe.smallest_learning_rate):
-        started = time.monotonic()
-        loss = _epoch(network, optimiser, recipe, train_views, prior, progress, seed)
-        measures = measure(score_views(network, validation_views), seed)
+        loss = _epoch(network, optimiser, recipe, train_views, prior, progress, approach_points, checkpoint)
+        measures, of_all = validate(network, validation_views, seed)
         _schedule(recipe, progress, measures["served_loss"])
-        if measures["served_loss"] <= progress.best_loss:
-            progress.best_loss = measures["served_loss"]
+        if recipe.keep == "last" or measures["served_loss"] <= progress.best_loss:
             training = {
                 "data": {"scenes": len(scene_files(data)), "views": len(train_views), "labels": labels, "prior": prior},
-                "recipe": asdict(recipe), "seed": seed, "epoch": progress.epoch, "validation": measures,
+                "recipe": asdict(recipe), "approach_points_per_step": approach_points, "seed": seed,
+                "epoch": progress.epoch, "validation": measures, "validation_with_blocked": of_all,
             }  # fmt: skip
             header = weights.Header(name, version, configuration_of(network), tuple(measures["calibration"]), training)
             weights.save(out, network.state_dict(), header)
-        _save_checkpoint(checkpoint, network, optimiser, progress)
+        progress.best_loss = min(progress.best_loss, measures["served_loss"])
+        # A run that is stopped between these two repeats the epoch's end and its line: an epoch's last line counts.
         with out.with_suffix(".log.jsonl").open("a") as log:
-            log.write(json.dumps({"epoch": progress.epoch, "train_loss": loss, **measures,
-                                  "seconds": time.monotonic() - started}) + "\n")  # fmt: skip
+            log.write(json.dumps({"epoch": progress.epoch, "train_loss": loss, **measures, "with_blocked": of_all,
+                                  "seconds": progress.seconds}) + "\n")  # fmt: skip
+        progress.seconds = 0.0
+        _save_checkpoint(checkpoint, network, optimiser, progress)
     _, header = weights.load(out)
     return dict(header.training or {})
 
@@ -187,16 +219,19 @@ def _epoch(
     views: Sequence[LabelledView],
     prior: float,
     progress: _Progress,
-    seed: int,
+    approach_points: int | None,
+    checkpoint: Path,
 ) -> float:
-    """One pass over the views in a random order; the mean training loss."""
-    rng = np.random.default_rng([seed, progress.epoch])
-    order = rng.permutation(len(views))
+    """One pass over the views in a random order, from the step that was reached; the mean training loss.
+
+    What is drawn in a step derives from the seed, the epoch and the view alone, so that a resumed run draws the same.
+    """
+    order = np.random.default_rng([progress.seed, progress.epoch]).permutation(len(views))
     steps = math.ceil(len(views) / recipe.views_per_step)
     log_odds = math.log(prior / (1 - prior))
-    total = 0.0
     network.train()
-    bar = tqdm(range(steps), desc=f"epoch {progress.epoch}", mininterval=10)
+    bar = tqdm(range(progress.step, steps), desc=f"epoch {progress.epoch}", mininterval=10)
+    seconds, started, saved = progress.seconds, time.monotonic(), time.monotonic()
     for step in bar:
         if recipe.cosine:
             share = (progress.epoch + step / steps) / recipe.max_epochs
@@ -206,24 +241,43 @@ def _epoch(
             group["lr"] = progress.learning_rate
         optimiser.zero_grad()
         for index in order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step]:
-            loss = _view_loss(network, augment(views[index], rng), log_odds, recipe, rng)
+            rng = np.random.default_rng([progress.seed, progress.epoch, int(index)])
+            loss = _view_loss(network, augment(views[index], rng), log_odds, recipe, rng, approach_points)
             (loss / recipe.views_per_step).backward()
-            total += float(loss.detach())
+            progress.loss += float(loss.detach())
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
-        bar.set_postfix(loss=f"{total / ((step + 1) * recipe.views_per_step):.4f}")
-    progress.epoch += 1
-    return total / len(views)
+        progress.step = step + 1
+        progress.seconds = seconds + time.monotonic() - started
+        bar.set_postfix(loss=f"{progress.loss / (progress.step * recipe.views_per_step):.4f}")
+        if time.monotonic() - saved >= CHECKPOINT_S:
+            _save_checkpoint(checkpoint, network, optimiser, progress)
+            saved = time.monotonic()
+    mean = progress.loss / len(views)
+    progress.epoch, progress.step, progress.loss = progress.epoch + 1, 0, 0.0
+    return mean
 
 
 def _view_loss(
-    network: Network, view: LabelledView, log_odds: float, recipe: Recipe, rng: np.random.Generator
+    network: Network,
+    view: LabelledView,
+    log_odds: float,
+    recipe: Recipe,
+    rng: np.random.Generator,
+    approach_points: int | None = None,
 ) -> Tensor:
-    """Cross-entropy of the outcomes of some candidates, whose probability is sigmoid(logit + log odds of the prior)."""
+    """Cross-entropy of the outcomes of some candidates, whose probability is sigmoid(logit + log odds of the prior).
+
+    With `approach_points`, of candidates of so many approach points.
+    """
+    shown = torch.ones_like(view.collision_free)
+    if approach_points is not None:
+        there = view.approach.unique().numpy()
+        shown = torch.isin(view.approach, torch.from_numpy(rng.permutation(there)[:approach_points]))
     which = torch.cat(
         [
-            _some(view.collision_free, recipe.candidates_per_view, rng),
-            _some(~view.collision_free, recipe.blocked_per_view, rng),
+            _some(shown & view.collision_free, recipe.candidates_per_view, rng),
+            _some(shown & ~view.collision_free, recipe.blocked_per_view, rng),
         ]
     )
     target = view.success[which]

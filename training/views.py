@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import dataclass
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -15,9 +15,11 @@ from numpy.typing import NDArray
 
 from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
-from tesnet.cloud import PreparationConfig, PreparedCloud, estimate_normals, orient_normals
+from tesnet.cloud import PreparationConfig, PreparedCloud, orient_normals
 from tesnet.geometry import Pose
 from tesnet.whole_file import whole_file
+
+_TODAY = PreparationConfig()
 
 
 class LabelsError(Exception):
@@ -65,10 +67,23 @@ def count_outcomes(outcomes: Iterable[NDArray[np.uint8]]) -> NDArray[np.int64]:
     return counts
 
 
-def save_scene(path: Path, description: Mapping[str, Any], views: Sequence[LabelledView]) -> None:
-    """Writes one scene, whole: the cloud as float16 (0.06 mm at 0.1 m), indices as uint16, outcomes as bytes."""
+def save_scene(
+    path: Path,
+    description: Mapping[str, Any],
+    views: Sequence[LabelledView],
+    preparation: PreparationConfig = _TODAY,
+) -> None:
+    """Writes one scene, whole: the cloud as float16 (0.06 mm at 0.1 m), indices as uint16, outcomes as bytes.
+
+    Args:
+        path: of the file.
+        description: of the scene, JSON values.
+        views: of the scene.
+        preparation: of the views' clouds; the file names it.
+    """
+    described = {**description, "preparation": asdict(preparation)}
     arrays: dict[str, NDArray[Any]] = {
-        "description": np.frombuffer(json.dumps(description).encode(), dtype=np.uint8),
+        "description": np.frombuffer(json.dumps(described).encode(), dtype=np.uint8),
         "counts": count_outcomes(view.outcomes.numpy() for view in views),
     }
     for number, view in enumerate(views):
@@ -84,6 +99,8 @@ def save_scene(path: Path, description: Mapping[str, Any], views: Sequence[Label
         arrays |= {
             f"{number}/frame": np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8),
             f"{number}/points": cloud.points.numpy().astype(np.float16),
+            f"{number}/normals": cloud.normals.numpy().astype(np.float16),
+            f"{number}/spectrum": cloud.spectrum.numpy().astype(np.float16),
             f"{number}/neighbours": cloud.neighbours.numpy().astype(np.uint16),
             f"{number}/approach": view.approach.numpy().astype(np.uint16),
             f"{number}/contact": view.contact.numpy().astype(np.uint16),
@@ -128,17 +145,14 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
         return torch.from_numpy(array.astype(np.int64) if array.dtype == np.uint16 else array).to(dtype)
 
     points = tensor("points", torch.float32)
-    neighbours = tensor("neighbours", torch.long)
     viewpoints = torch.tensor(frame["viewpoints"])
-    # What the network is shown is prepared as the service does it today.
-    config = PreparationConfig()
-    normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
+    normals = torch.nn.functional.normalize(tensor("normals", torch.float32), dim=1)
     normals, view_directions = orient_normals(points, normals, viewpoints)
     cloud = PreparedCloud(
         points=points,
         normals=normals,
-        neighbours=neighbours,
-        spectrum=spectrum,
+        neighbours=tensor("neighbours", torch.long),
+        spectrum=tensor("spectrum", torch.float32),
         view_directions=view_directions,
         viewpoints=viewpoints,
         up=None if frame["up"] is None else torch.tensor(frame["up"]),
@@ -172,7 +186,28 @@ def scene_files(folders: Sequence[Path]) -> list[Path]:
     return found
 
 
-def load_views(folders: Sequence[Path]) -> Iterator[LabelledView]:
-    """Every labelled view under the folders, scene by scene."""
+def load_views(folders: Sequence[Path], preparation: PreparationConfig) -> Iterator[LabelledView]:
+    """Every labelled view under the folders, scene by scene.
+
+    Raises:
+        LabelsError: no scenes, or clouds that were prepared in another way.
+    """
     for path in scene_files(folders):
-        yield from load_scene(path)[1]
+        description, views = load_scene(path)
+        check_preparation(path, description, preparation)
+        yield from views
+
+
+def check_preparation(path: Path, description: Mapping[str, Any], wanted: PreparationConfig) -> None:
+    """Raises LabelsError unless the clouds of a scene file were prepared as wanted."""
+    found = description.get("preparation", {})
+    different = [
+        f"{name} is {found.get(name)}, not {value}"
+        for name, value in asdict(wanted).items()
+        if found.get(name) != value
+    ]
+    if different:
+        raise LabelsError(
+            f"the clouds of {path} were prepared for another network ({'; '.join(different)}); "
+            "render an archive of their labels for this one with `python -m training unpack --model NAME`"
+        )

@@ -11,13 +11,26 @@ from typing import Any
 
 from tesnet import weights
 from tesnet.errors import WeightsError
+from tesnet.networks.edgegrasp import EdgeGrasp, EdgeGraspConfig
+from tesnet.networks.gatv2 import GATv2Config, TesNetGATv2
+from tesnet.networks.gpd import GPD, GPDConfig
+from tesnet.networks.heuristic import Heuristic, HeuristicConfig
 from tesnet.networks.network import Network, encode
+from tesnet.networks.pointnetgpd import PointNetGPD, PointNetGPDConfig
 from tesnet.networks.tesnet import TesNet, TesNetConfig
+from tesnet.networks.tesnet_paper import TesNetEuclideanConfig, TesNetPaper, TesNetPaperConfig
 
 __all__ = ["NETWORKS", "Network", "build", "encode", "load"]
 
 NETWORKS: Mapping[str, tuple[type[Network], type[Any]]] = {
     "tesnet": (TesNet, TesNetConfig),
+    "tesnet-paper": (TesNetPaper, TesNetPaperConfig),
+    "tesnet-euclidean": (TesNetPaper, TesNetEuclideanConfig),
+    "gatv2": (TesNetGATv2, GATv2Config),
+    "edgegrasp": (EdgeGrasp, EdgeGraspConfig),
+    "pointnetgpd": (PointNetGPD, PointNetGPDConfig),
+    "gpd": (GPD, GPDConfig),
+    "heuristic": (Heuristic, HeuristicConfig),
 }
 """The class of each network and of its configuration, whose fields all have defaults."""
 

@@ -9,8 +9,9 @@ import numpy as np
 import pytest
 import torch
 
+from tesnet.cloud import PreparationConfig
 from training.__main__ import main
-from training.archive import pack, unpack
+from training.archive import _draw, pack, unpack
 from training.generate import GenerateConfig, generate, is_free
 from training.views import LabelledView, LabelsError, load_scene, save_scene, scene_files
 
@@ -81,6 +82,27 @@ def surely_free(view: LabelledView) -> tuple[torch.Tensor, torch.Tensor]:
         [is_free(replace(view.cloud, points=view.cloud.points + moved), view.candidates) for moved in noise]
     )
     return votes[0], (votes == votes[0]).all(dim=0)
+
+
+def test_some_scenes_are_drawn_and_prepared_as_a_network_wants_them(labels: Path, tmp_path: Path) -> None:
+    pack([labels], tmp_path / "archive")
+    folders = {name: tmp_path / name for name in ("all", "coarse", "again")}
+    fine = PreparationConfig(voxel_size=0.0025)
+    unpack(tmp_path / "archive", "procedural-train", folders["all"])
+    for name, seed, preparation in (("coarse", 0, PreparationConfig()), ("again", 0, fine)):
+        told = unpack(
+            tmp_path / "archive", "procedural-train", folders[name], scenes=1, seed=seed, preparation=preparation
+        )
+        assert told == {"scenes": 1}
+    (one,), (same,) = scene_files([folders["coarse"]]), scene_files([folders["again"]])
+    assert one.name == same.name
+    assert one.read_bytes() == (folders["all"] / one.name).read_bytes()
+    (coarse, *_), (dense, *_) = load_scene(one)[1], load_scene(same)[1]
+    assert len(dense.cloud) > 1.5 * len(coarse.cloud)
+    drawn = {tuple(np.flatnonzero(_draw(sorted((tmp_path / "archive").glob("*.npz")), 1, seed))) for seed in range(20)}
+    assert len(drawn) > 1
+    with pytest.raises(LabelsError, match="prepared for another network"):
+        unpack(tmp_path / "archive", "procedural-train", folders["coarse"], preparation=fine)
 
 
 def test_shallow_pairs_come_back_straight_down(labels: Path, tmp_path: Path) -> None:

@@ -12,9 +12,11 @@ import pytest
 import torch
 
 from tesnet import networks, weights
+from tesnet.candidates import Candidates
 from tesnet.predictor import GraspPredictor
 from tests.tesnet.scenes import tabletop_query
 from tests.training.synthetic import labelled_view, write
+from training import evaluate as evaluating
 from training import fit as fitting
 from training.__main__ import main
 from training.evaluate import evaluate
@@ -65,6 +67,85 @@ def test_a_stopped_run_goes_on_from_its_checkpoint(folder: Path, tmp_path: Path)
     assert measured["all"]["candidates"] == 60
     assert measured["all"]["balanced_loss"] == pytest.approx(header.training["validation"]["balanced_loss"], abs=1e-4)
     assert set(measured) == {"weights_sha256", "all", "packed"}
+
+
+def test_a_run_that_is_stopped_within_an_epoch_ends_as_if_it_had_not_been(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    recipe = replace(RECIPE, views_per_step=1)
+    run(folder, tmp_path / "whole.safetensors", recipe)
+    monkeypatch.setattr(fitting, "CHECKPOINT_S", 0.0)
+    view_loss, calls = fitting._view_loss, []
+
+    def stops_in_the_second_epoch(*arguments: Any) -> torch.Tensor:
+        calls.append(arguments)
+        if len(calls) == 3 + 2:
+            raise KeyboardInterrupt
+        return view_loss(*arguments)
+
+    monkeypatch.setattr(fitting, "_view_loss", stops_in_the_second_epoch)
+    with pytest.raises(KeyboardInterrupt):
+        run(folder, tmp_path / "parts.safetensors", recipe)
+    run(folder, tmp_path / "parts.safetensors", recipe)
+    assert len(calls) == 3 + 2 + 2  # the step that failed is taken again, the one before it is not
+    whole, parts = (
+        [json.loads(line) for line in (tmp_path / f"{name}.log.jsonl").read_text().splitlines()]
+        for name in ("whole", "parts")
+    )
+    assert [entry["epoch"] for entry in parts] == [1, 2]
+    for first, second in zip(whole, parts, strict=True):
+        assert first["train_loss"] == pytest.approx(second["train_loss"], abs=1e-5)
+    expected, _ = weights.load(tmp_path / "whole.safetensors")
+    for name, tensor in weights.load(tmp_path / "parts.safetensors")[0].items():
+        torch.testing.assert_close(tensor, expected[name], atol=1e-5, rtol=0)
+
+
+def test_a_comparison_keeps_the_last_epoch_and_measures_all_candidates(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    losses = iter([0.3, 0.6])
+    validate = evaluating.validate
+
+    def worse_and_worse(*arguments: Any) -> Any:
+        of_free, of_all = validate(*arguments)
+        return of_free | {"served_loss": next(losses)}, of_all
+
+    monkeypatch.setattr(fitting, "validate", worse_and_worse)
+    for recipe, epoch in ((replace(RECIPE, keep="best"), 1), (replace(RECIPE, keep="last"), 2)):
+        losses = iter([0.3, 0.6])
+        run(folder, tmp_path / f"{epoch}.safetensors", recipe)
+        training = weights.load(tmp_path / f"{epoch}.safetensors")[1].training
+        assert training["epoch"] == epoch
+        assert training["validation_with_blocked"]["candidates"] == 60
+    assert PRESETS["comparison"].keep == "last"
+    assert PRESETS["comparison"].blocked_per_view > 0
+
+
+def test_a_network_that_learns_nothing_is_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(LabelsError, match="heuristic has no parameters to train"):
+        fit("heuristic", [folder / "train"], [folder / "validation"], RECIPE, tmp_path / "a.safetensors")
+
+
+def test_labels_rendered_for_another_network_are_refused(folder: Path, tmp_path: Path) -> None:
+    with pytest.raises(LabelsError, match="prepared for another network"):
+        fit("gpd", [folder / "train"], [folder / "validation"], RECIPE, tmp_path / "a.safetensors", threads=1)
+
+
+def test_a_step_may_show_the_candidates_of_few_approach_points() -> None:
+    view = labelled_view(count=60)
+    shown = []
+
+    def score(features: Any, cloud: Any, candidates: Candidates, mirror: Any) -> torch.Tensor:
+        shown.append(candidates.approach)
+        return torch.zeros(len(candidates))
+
+    network = SimpleNamespace(encode_batch=lambda clouds: [None], score=score)
+    for limit in (3, None):
+        fitting._view_loss(network, view, 0.0, RECIPE, np.random.default_rng(0), limit)  # type: ignore[arg-type]
+    few, many = shown
+    assert len(few.unique()) == 3
+    assert len(many.unique()) > 3
+    assert len(few) == min(int(torch.isin(view.approach, few).sum()), RECIPE.candidates_per_view)
 
 
 def test_a_checkpoint_of_another_recipe_is_refused(folder: Path, tmp_path: Path) -> None:
