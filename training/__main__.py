@@ -157,6 +157,13 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--validation", type=Path, nargs="+", required=True, help="folders of labelled validation scenes"
     )
+    parser.add_argument(
+        "--calibration",
+        type=Path,
+        nargs="+",
+        default=(),
+        help="folders of labelled scenes that fit the calibration of the served score; default: those of --validation",
+    )
     parser.add_argument("--preset", default="default", choices=sorted(PRESETS))
     parser.add_argument("--start", type=Path, metavar="WEIGHTS", help="begin with these instead of random weights")
     parser.add_argument("--epochs", type=_positive, help="stop after so many, whatever the schedule")
@@ -180,6 +187,7 @@ def _fit(options: argparse.Namespace) -> dict[str, object]:
         seed=options.seed,
         version=options.version,
         start=options.start,
+        calibration=options.calibration,
     )
 
 

@@ -45,13 +45,19 @@ def evaluate(name: str, path: Path | None, data: Sequence[Path], seed: int = 0) 
     return result
 
 
-def validate(network: Network, views: Sequence[LabelledView], seed: int) -> tuple[dict[str, Any], dict[str, Any]]:
-    """Measures on the candidates that the observed cloud leaves free, which fit the calibration, and on all."""
+def validate(
+    network: Network, views: Sequence[LabelledView], seed: int, calibration_views: Sequence[LabelledView] = ()
+) -> tuple[dict[str, Any], dict[str, Any]]:
+    """Measures on the candidates that the observed cloud leaves free, and on all.
+
+    The calibration is fitted to the free candidates of `calibration_views` or, without any, to those of `views`.
+    """
     scored = score_views(network, views, blocked=True)
     shown = [view for view in views if len(view.outcomes)]
     masks = [view.collision_free.numpy() for view in shown]
     free = [(logits[mask], success[mask]) for (logits, success), mask in zip(scored, masks, strict=True) if mask.any()]
-    of_free = measure(free, seed)
+    scored_apart = score_views(network, calibration_views)
+    of_free = measure(free, seed, metrics.fit_calibration(*_joined(scored_apart)) if scored_apart else None)
     return of_free, measure(scored, seed, tuple(of_free["calibration"]))
 
 

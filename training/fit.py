@@ -120,6 +120,7 @@ def fit(
     seed: int = 0,
     version: str = "0",
     start: Path | None = None,
+    calibration: Sequence[Path] = (),
 ) -> dict[str, Any]:
     """Trains network `name`, writes its weights to `out` and returns its validation measures.
 
@@ -132,7 +133,7 @@ def fit(
     Args:
         name: of the network.
         data: folders of labelled training scenes.
-        validation: folders of labelled scenes that choose the epoch and fit the calibration.
+        validation: folders of labelled scenes that choose the epoch, unless the recipe keeps the last.
         recipe: how to train.
         out: weights file.
         epochs: stop after so many, whatever the recipe's schedule.
@@ -140,6 +141,7 @@ def fit(
         seed: of the first weights, of orders and of draws.
         version: that the weights' header carries.
         start: weights to begin with, also older ones with fewer inputs; None for random ones.
+        calibration: folders of labelled scenes that fit the calibration; those of `validation` unless given.
 
     Raises:
         LabelsError: folders without usable labels or with clouds of another preparation, a checkpoint of another recipe
@@ -158,6 +160,7 @@ def fit(
             "generate more labels, or with more labels per view"
         )
     validation_views = list(load_views(validation, network.preparation))
+    calibration_views = list(load_views(calibration, network.preparation))
     labels = sum(len(view.outcomes) for view in train_views)
     prior = sum(int(view.success.sum()) for view in train_views) / labels
     optimiser = _optimiser(network, recipe)
@@ -172,7 +175,7 @@ def fit(
     # Only halving ends the training: along the cosine the rate is small at the start, too.
     while progress.epoch < last_epoch and (recipe.cosine or progress.learning_rate >= recipe.smallest_learning_rate):
         loss = _epoch(network, optimiser, recipe, train_views, prior, progress, approach_points, checkpoint)
-        measures, of_all = validate(network, validation_views, seed)
+        measures, of_all = validate(network, validation_views, seed, calibration_views)
         _schedule(recipe, progress, measures["served_loss"])
         if recipe.keep == "last" or measures["served_loss"] <= progress.best_loss:
             training = {

@@ -18,6 +18,7 @@ from tests.tesnet.scenes import tabletop_query
 from tests.training.synthetic import labelled_view, write
 from training import evaluate as evaluating
 from training import fit as fitting
+from training import metrics
 from training.__main__ import main
 from training.evaluate import evaluate
 from training.fit import PRESETS, Recipe, fit
@@ -229,3 +230,16 @@ def test_the_command_says_what_is_wrong_with_its_input(tmp_path: Path, capsys: p
     paths = {"--data": tmp_path / "none", "--validation": tmp_path, "--out": tmp_path / "a", "--threads": 1}
     assert main(["fit", *(str(word) for pair in paths.items() for word in pair)]) == 2
     assert "python -m training generate" in capsys.readouterr().err
+
+
+def test_the_calibration_is_fitted_where_it_is_told_to_be(folder: Path, tmp_path: Path) -> None:
+    run(folder, tmp_path / "apart.safetensors", epochs=1, calibration=[folder / "train"])
+    run(folder, tmp_path / "same.safetensors", epochs=1)
+    (apart, _), (same, _) = (networks.load(tmp_path / f"{name}.safetensors") for name in ("apart", "same"))
+    torch.testing.assert_close(apart.state_dict(), same.state_dict())  # what is learned does not depend on it
+    _, header = weights.load(tmp_path / "apart.safetensors")
+    views = list(fitting.load_views([folder / "train"], apart.preparation))
+    scored = evaluating.score_views(apart, views)
+    joined = [np.concatenate(parts) for parts in zip(*scored, strict=True)]
+    assert header.calibration == pytest.approx(metrics.fit_calibration(*joined))
+    assert header.calibration != weights.load(tmp_path / "same.safetensors")[1].calibration
