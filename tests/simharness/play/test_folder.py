@@ -91,3 +91,13 @@ def test_a_folder_without_a_run_is_named(tmp_path: Path) -> None:
         RunFolder(tmp_path).read_run()
     with pytest.raises(UsageError, match="holds no run"):
         RunFolder(tmp_path / "run.json").read_run()
+
+
+def test_files_are_rewritten_in_the_order_of_seeds_rounds_and_attempts(tmp_path: Path, run: Run) -> None:
+    folder = RunFolder(tmp_path)
+    folder.rewrite(reversed(run.rounds))
+    for name in ("rounds.jsonl", "attempts.jsonl"):
+        lines = [json.loads(line) for line in (tmp_path / name).read_text().splitlines()]
+        keys = [(line["seed"], line["round"], line["attempt"] if name == "attempts.jsonl" else 0) for line in lines]
+        assert keys == sorted(keys)
+    assert same(folder.read_rounds(), list(run.rounds))

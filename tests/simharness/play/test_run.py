@@ -5,13 +5,19 @@ import json
 import os
 import signal
 import sys
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
 import pytest
 
 from simharness.__main__ import main
+from simharness.errors import RunBroken
+from simharness.play.folder import RunFolder
+from simharness.play.records import ModelRecord, RoundRecord, Serving
+from simharness.play.run import Hooks, _Log, _Rounds
 from simharness.play.server import LocalService
+from simharness.sim.objects import ObjectModel
 from tests.simharness.commands import WAIT_S, lines, results, run_it, started, wait_for_a_round
 
 pytestmark = pytest.mark.sim
@@ -104,3 +110,38 @@ def test_a_service_of_ours_that_dies_in_mid_run_is_reported_with_its_last_words(
     assert "the stub dies as it was told" in errors
     report = json.loads((tmp_path / "report.json").read_text())
     assert (report["complete"], report["rounds"]) == (False, 1)
+
+
+def test_a_worker_whose_own_service_serves_another_model_is_refused(
+    stub_command: tuple[str, ...], monkeypatch: pytest.MonkeyPatch, make_settings: Any, objects: tuple[ObjectModel, ...]
+) -> None:
+    monkeypatch.setattr("simharness.play.run.LocalService", functools.partial(LocalService, command=stub_command))
+    stub = ModelRecord("tesnet", "stub", "0" * 64)
+    with _Rounds(make_settings(), objects, None, stub, watched=False).begin() as play:
+        assert callable(play)
+    for name, value in (("version", "other"), ("weights_sha256", "1" * 64)):
+        other = replace(stub, **{name: value})
+        with (
+            pytest.raises(RunBroken, match="another model than this machine's"),
+            _Rounds(make_settings(), objects, None, other, watched=False).begin(),
+        ):
+            pass
+
+
+def test_rounds_are_written_in_their_order_whatever_the_order_they_finish_in(
+    tmp_path: Path, make_settings: Any, make_round: Any
+) -> None:
+    settings = make_settings(rounds=3, seeds=(1, 0))
+    heard: list[RoundRecord] = []
+    log = _Log(settings, RunFolder(tmp_path), Hooks(lambda _: None, heard.append), resume=False)
+    log.open(ModelRecord("tesnet", "1", "0" * 64), Serving(None, 1, "cpu"))
+    assert log.todo == [(1, 0), (1, 1), (1, 2), (0, 0), (0, 1), (0, 2)]
+    arriving = [(1, 2), (0, 1), (1, 0), (0, 0), (0, 2), (1, 1)]
+    for key in arriving:
+        log.take(make_round(*key, ["success", "slip"]))
+    assert [(record.seed, record.round) for record in heard] == arriving
+    assert log.todo == []
+    assert [(record.seed, record.round) for record in log.close()] == sorted(arriving)
+    for name, each in (("rounds.jsonl", 1), ("attempts.jsonl", 2)):
+        written = [(line["seed"], line["round"]) for line in lines(tmp_path / name)]
+        assert written == [key for key in sorted(arriving) for _ in range(each)]

@@ -8,8 +8,17 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from simharness.sim.execute import Outcome, attempt, label_candidates, label_strict, snapshot_of
-from simharness.sim.hand import MAX_WIDTH, Hand
+from simharness.sim.execute import (
+    RETREAT_DISTANCE,
+    Executor,
+    Grip,
+    Outcome,
+    attempt,
+    label_candidates,
+    label_strict,
+    snapshot_of,
+)
+from simharness.sim.hand import MAX_WIDTH, Hand, Placement
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import TABLE_HEIGHT, restore_scene, settle
 from simharness.sim.world import BASE_LINK, World, data_path
@@ -45,9 +54,9 @@ def from_above(x: float = 0.15, y: float = 0.15, z: float = TABLE_HEIGHT + 0.025
     return np.array([[1.0, 0, 0, x], [0, -1.0, 0, y], [0, 0, -1.0, z], [0, 0, 0, 1.0]])
 
 
-def from_the_side(z: float = TABLE_HEIGHT + 0.025) -> NDArray[np.float64]:
-    """A grasp of the middle that travels along +x, 10 deg downwards, and closes along y."""
-    angle = np.deg2rad(10.0)
+def from_the_side(z: float = TABLE_HEIGHT + 0.025, downwards_deg: float = 10.0) -> NDArray[np.float64]:
+    """A grasp of the middle that travels along +x, a little downwards, and closes along y."""
+    angle = np.deg2rad(downwards_deg)
     travel = np.array([np.cos(angle), 0.0, -np.sin(angle)])
     matrix = np.eye(4)
     matrix[:3, :3] = np.stack([np.cross([0.0, 1.0, 0.0], travel), [0.0, 1.0, 0.0], travel], axis=1)
@@ -188,3 +197,48 @@ def test_the_same_attempts_end_the_same_to_the_bit_in_a_fresh_world() -> None:
             return record
 
     assert run() == run()
+
+
+def test_strict_holds_what_both_fingers_touch_and_edge_what_any_part_touches() -> None:
+    one, two = frozenset({1}), frozenset({1, 2})
+    assert Grip(two, one, empty=False).held("strict") == one
+    assert Grip(two, one, empty=False).held("edge") == two
+    for executor in ("strict", "edge"):
+        assert Grip(two, one, empty=True).held("strict" if executor == "strict" else "edge") == frozenset()
+
+
+def test_an_object_at_one_finger_alone_is_lifted_by_edge_and_slips_from_strict() -> None:
+    # A cube stands between the fingers; a post that nothing moves keeps one finger from it.
+    def run(executor: Executor) -> Outcome:
+        with World() as world:
+            hand, _ = scene(world, (0.15, 0.165))
+            world.add_static_box((0.005, 0.004, 0.02), (0.15, 0.138, TABLE_HEIGHT + 0.02), colour=(1.0, 1.0, 1.0, 1.0))
+            return attempt(world, hand, from_above(), MAX_WIDTH, executor)
+
+    strict, edge = run("strict"), run("edge")
+    assert strict.closed is not None
+    assert strict.closed.touched
+    assert not strict.closed.pinched
+    assert strict.kind == "slip"
+    assert edge.closed == strict.closed
+    assert edge.kind != "slip"
+
+
+@pytest.mark.parametrize(("from_down_deg", "upwards"), [(50.0, False), (59.0, False), (61.0, True), (75.0, True)])
+def test_hands_retreat_backwards_up_to_60_deg_from_straight_down_and_upwards_beyond(
+    from_down_deg: float, upwards: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    asked: list[tuple[float, float]] = []
+    carry_to = Hand.carry_to
+
+    def told(self: Hand, grasp: Placement, *, behind: float = 0.0, above: float = 0.0) -> None:
+        asked.append((behind, above))
+        carry_to(self, grasp, behind=behind, above=above)
+
+    with World() as world:
+        hand, _ = scene(world, MIDDLE)
+        monkeypatch.setattr(Hand, "carry_to", told)
+        outcome = attempt(world, hand, from_the_side(TABLE_HEIGHT + 0.04, 90.0 - from_down_deg), MAX_WIDTH, "edge")
+    assert outcome.closed is not None
+    assert outcome.closed.touched
+    assert asked[-1] == pytest.approx((0.0, RETREAT_DISTANCE) if upwards else (RETREAT_DISTANCE, 0.0))

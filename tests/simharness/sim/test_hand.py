@@ -119,3 +119,31 @@ def test_the_constraint_carries_the_hand_and_gravity_does_not(world: World) -> N
     world.step(120)
     np.testing.assert_allclose(hand.T_world_grasp.matrix, start.matrix, atol=1e-4)
     assert hand.width == pytest.approx(MAX_WIDTH, abs=1e-4)
+
+
+@pytest.mark.parametrize("deep", [0, 1])
+def test_the_deepest_contact_is_the_deepest_whichever_was_found_first(world: World, deep: int) -> None:
+    hand = Hand(world)
+    hand.place(grasp(0.0, 0.0, 0.2).matrix, MAX_WIDTH)  # turned over, so that its left finger is at negative y
+    tip = 0.2 - 0.112 + HAND_TO_TCP
+    depths = [0.006 if finger == deep else 0.002 for finger in (0, 1)]
+    plates = [
+        world.add_static_box((0.01, 0.01, 0.01), (0.0, side * 0.045, tip + depth - 0.01), colour=(1, 1, 1, 1))
+        for side, depth in zip((-1, 1), depths, strict=True)
+    ]
+    world.find_contacts()
+    found = hand.deepest_contact()
+    assert found is not None
+    assert (found.body, found.part) == (plates[deep], ("left finger", "right finger")[deep])
+    assert found.depth == max(-contact.distance for contact in world.contacts(hand.body) if contact.other != hand.body)
+    assert found.depth > 0.004
+
+
+def test_a_finger_that_moves_is_not_overlooked_for_one_that_stands(
+    world: World, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    hand = Hand(world)
+    for speeds in ((0.0, -0.05), (0.05, 0.0)):
+        now = dict(zip(hand.fingers, speeds, strict=True))
+        monkeypatch.setattr(World, "joint_speed", lambda _world, _body, joint, now=now: now[joint])
+        assert hand.finger_speed == 0.05

@@ -3,13 +3,15 @@
 from __future__ import annotations
 
 import json
+from pathlib import Path
 
 import numpy as np
 import pytest
 
-from simharness.sim.objects import ObjectModel
+from simharness.sim.objects import ObjectModel, SceneKind
 from simharness.sim.scene import (
     RESTING_SPEED,
+    SCALE_RANGES,
     TABLE_HEIGHT,
     WORKSPACE,
     Scene,
@@ -24,6 +26,14 @@ pytestmark = pytest.mark.sim
 
 CUBE = ObjectModel("cube", data_path() / "cube_small.urdf")
 """5 cm at scale 1."""
+
+LOPSIDED = """<robot name="lopsided"><link name="base">
+<inertial><origin xyz="0.01 0.005 -0.01" rpy="0 0 0"/><mass value="0.1"/>
+<inertia ixx="1e-4" ixy="0" ixz="0" iyy="1e-4" iyz="0" izz="1e-4"/></inertial>
+<collision><geometry><box size="0.06 0.04 0.05"/></geometry></collision>
+<visual><geometry><box size="0.06 0.04 0.05"/></geometry></visual>
+</link></robot>"""
+"""A box whose centre of mass lies 15 mm beside its origin."""
 
 
 def poses(world: World, scene: Scene) -> list[bytes]:
@@ -88,3 +98,47 @@ def test_an_object_that_leaves_the_workspace_is_taken_out_and_reported() -> None
         assert settle(world) == (runaway,)
         assert runaway not in world.objects
         assert len(world.objects) == len(scene.placed) - 1
+
+
+@pytest.mark.parametrize("kind", ["packed", "pile"])
+def test_a_models_own_scale_is_part_of_the_drawn_one(kind: SceneKind) -> None:
+    half_size = ObjectModel("cube", CUBE.urdf, scale_hint=0.5)
+    with World() as world:
+        whole = make_scene(world, kind, [CUBE], np.random.default_rng(2))
+    with World() as world:
+        half = make_scene(world, kind, [half_size], np.random.default_rng(2))
+        low, high = SCALE_RANGES[kind]
+        for item in half.placed:
+            assert 0.5 * low <= item.scale <= 0.5 * high
+            assert world.position(item.body_id)[2] < TABLE_HEIGHT + 0.03  # so small it is, too
+    assert half.placed[0].scale == pytest.approx(0.5 * whole.placed[0].scale)
+
+
+def test_a_body_whose_mass_is_beside_its_origin_is_put_back_where_it_was(tmp_path: Path) -> None:
+    lopsided = ObjectModel("lopsided", tmp_path / "lopsided.urdf")
+    lopsided.urdf.write_text(LOPSIDED)
+    with World() as world:
+        made = make_scene(world, "packed", [lopsided], np.random.default_rng(4), num_objects=3)
+        before = {item.body_id: world.pose(item.body_id).matrix for item in made.placed}
+        assert len(before) >= 2
+        description = json.loads(json.dumps(describe(made)))
+    with World() as world:
+        restored = restore_scene(world, description, {"lopsided": lopsided})
+        for old, new in zip(made.placed, restored.placed, strict=True):
+            np.testing.assert_allclose(world.pose(new.body_id).matrix, before[old.body_id], atol=1e-6)
+            np.testing.assert_allclose(new.pose.matrix, before[old.body_id], atol=1e-6)
+
+
+def test_what_leaned_on_a_lost_object_comes_to_rest_again() -> None:
+    with World() as world:
+        scene = make_scene(world, "packed", [CUBE], np.random.default_rng(1), num_objects=2)
+        below, above = (item.body_id for item in scene.placed)
+        half = [0.025 * item.scale for item in scene.placed]
+        # The lower one has its middle just outside the workspace, the one on top of it just inside.
+        edge = float(WORKSPACE.maximum[0])
+        upright = (0.0, 0.0, 0.0, 1.0)
+        world.set_pose(below, (edge + 0.003, 0.15, TABLE_HEIGHT + half[0]), upright)
+        world.set_pose(above, (edge - 0.006, 0.15, TABLE_HEIGHT + 2 * half[0] + half[1] + 0.001), upright)
+        assert settle(world) == (below,)
+        assert world.position(above)[2] == pytest.approx(TABLE_HEIGHT + half[1], abs=0.001)
+        assert world.speed(above) < RESTING_SPEED
