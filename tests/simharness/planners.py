@@ -45,3 +45,14 @@ class Scripted:
         air = np.diag([1.0, -1.0, -1.0, 1.0])
         air[:3, 3] = [0.15, 0.15, 0.6]
         return Plan(air[None], np.array([0.5]), np.array([0.08]), 2.0)
+
+
+class Alternating:
+    """Grasps air and an object in turn."""
+
+    def __init__(self) -> None:
+        self._air, self._good, self._asked = Scripted([None] * 50), TopDown(), 0
+
+    def plan(self, observation: Observation, seed: int) -> Plan:
+        self._asked += 1
+        return (self._air if self._asked % 2 else self._good).plan(observation, seed)

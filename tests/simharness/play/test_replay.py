@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import pytest
@@ -36,3 +37,12 @@ def test_an_attempt_that_was_not_made_is_refused(played: RoundRecord) -> None:
     assert find_attempt([played, played], len(played.attempts)) is played.attempts[0]
     with pytest.raises(UsageError, match=r"--attempt 99.*give 0 to"):
         find_attempt([played], 99)
+
+
+def test_a_replay_among_other_objects_says_so(
+    played: RoundRecord, objects: tuple[ObjectModel, ...], make_settings: Any
+) -> None:
+    first, *others = played.attempts
+    elsewhere = replace(played, attempts=(replace(first, objects=("set/other", *first.objects[1:])), *others))
+    with pytest.raises(UsageError, match=r"recorded was .* with set/other"):
+        replay(make_settings(), objects, elsewhere, 0)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from itertools import pairwise
 from typing import Any
 
 import numpy as np
@@ -16,7 +17,7 @@ from simharness.play.round import (
     scene_rng,
 )
 from simharness.sim.objects import ObjectModel
-from tests.simharness.planners import Scripted, TopDown
+from tests.simharness.planners import Alternating, Scripted, TopDown
 
 pytestmark = pytest.mark.sim
 
@@ -124,3 +125,12 @@ def test_the_cameras_noise_can_be_replaced(make_settings: Any) -> None:
     assert camera_noise(make_settings(noise_std=0.002)).point_sigma == 0.002
     assert camera_noise(make_settings(camera="giga", noise_std=0.0)).dex
     assert camera_noise(make_settings(depth_noise_std=0.001)).depth_sigma == 0.001
+
+
+def test_failures_end_a_round_only_in_a_row(objects: tuple[ObjectModel, ...], make_settings: Any) -> None:
+    record = play_round(make_settings(), objects, Alternating(), 0, 1)
+    outcomes = [attempt.success for attempt in record.attempts]
+    assert outcomes[:3] == [False, True, False]
+    in_a_row = [not (first or second) for first, second in pairwise(outcomes)]
+    assert not any(in_a_row[:-1])
+    assert in_a_row[-1] == (record.ended == "two_failures")

@@ -148,3 +148,11 @@ def test_fused_views_show_every_side_of_the_box(world: World) -> None:
 def test_an_unknown_preset_is_refused_with_the_valid_ones() -> None:
     with pytest.raises(ValueError, match="valid: " + ", ".join(PRESETS)):
         sample_camera("vgn7", np.random.default_rng(0))  # type: ignore[arg-type]
+
+
+def test_dex_noise_leaves_the_mean_depth_as_it_is() -> None:
+    rng = np.random.default_rng(0)
+    flat = np.full((8, 8), 0.6, dtype=np.float32)
+    means = [float(add_depth_noise(flat, Noise(dex=True), rng).mean()) for _ in range(800)]
+    assert np.mean(means) == pytest.approx(0.6, abs=0.003)
+    assert np.std(means) == pytest.approx(0.6 * np.sqrt(1000) * 0.001, rel=0.2)

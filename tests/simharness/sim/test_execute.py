@@ -86,6 +86,8 @@ def test_a_contact_at_the_start_pose_is_noticed_by_the_strict_executor_only() ->
     assert strict.contact_at_start
     assert edge.kind != "pregrasp"
     assert edge.contact_at_start
+    assert strict.first_contact is not None
+    assert edge.first_contact == strict.first_contact
 
 
 def test_a_contact_on_the_way_fails_under_strict_and_pushes_under_edge() -> None:
@@ -242,3 +244,32 @@ def test_hands_retreat_backwards_up_to_60_deg_from_straight_down_and_upwards_bey
     assert outcome.closed is not None
     assert outcome.closed.touched
     assert asked[-1] == pytest.approx((0.0, RETREAT_DISTANCE) if upwards else (RETREAT_DISTANCE, 0.0))
+
+
+def test_the_first_contact_is_told_whether_or_not_the_hand_goes_on() -> None:
+    def run(executor: Executor) -> Outcome:
+        with World() as world:
+            hand, _ = scene(world, MIDDLE, (0.15, 0.215))
+            return attempt(world, hand, from_above(), MAX_WIDTH, executor)
+
+    strict, edge = run("strict"), run("edge")
+    assert strict.first_contact is not None
+    assert edge.first_contact == strict.first_contact
+
+
+def test_the_hand_is_far_away_after_an_attempt() -> None:
+    with World() as world:
+        hand, _ = scene(world, MIDDLE)
+        attempt(world, hand, from_above(), MAX_WIDTH, "strict")
+        assert np.linalg.norm(hand.T_world_grasp.translation - [0.15, 0.15, TABLE_HEIGHT]) > 0.5
+        assert hand.width == pytest.approx(MAX_WIDTH, abs=1e-3)
+
+
+@pytest.mark.parametrize(("thickness", "empty"), [(0.012, False), (0.004, True)])
+def test_fingers_hold_nothing_when_they_all_but_meet(thickness: float, empty: bool) -> None:
+    with World() as world:
+        hand, _ = scene(world)
+        world.add_static_box((0.02, thickness / 2, 0.03), (0.15, 0.15, TABLE_HEIGHT + 0.03), colour=(1, 1, 1, 1))
+        outcome = attempt(world, hand, from_above(z=TABLE_HEIGHT + 0.04), MAX_WIDTH, "strict")
+        assert outcome.closed is not None
+        assert outcome.closed.empty is empty

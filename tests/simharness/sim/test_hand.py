@@ -147,3 +147,12 @@ def test_a_finger_that_moves_is_not_overlooked_for_one_that_stands(
         now = dict(zip(hand.fingers, speeds, strict=True))
         monkeypatch.setattr(World, "joint_speed", lambda _world, _body, joint, now=now: now[joint])
         assert hand.finger_speed == 0.05
+
+
+def test_what_the_palm_alone_touches_is_touched_and_not_pinched(world: World) -> None:
+    hand = Hand(world)
+    hand.place(grasp(0.0, 0.0, 0.2).matrix, MAX_WIDTH)
+    palm = 0.2 + HAND_TO_TCP - 0.03
+    block = world.add_static_box((0.01, 0.01, 0.01), (0.0, 0.0, palm), colour=(1, 1, 1, 1))
+    world.find_contacts()
+    assert hand.touched(within=0.0) == ({block}, set())

@@ -20,7 +20,7 @@ from simharness.sim.scene import (
     restore_scene,
     settle,
 )
-from simharness.sim.world import World, data_path
+from simharness.sim.world import TIMESTEP, World, data_path
 
 pytestmark = pytest.mark.sim
 
@@ -142,3 +142,28 @@ def test_what_leaned_on_a_lost_object_comes_to_rest_again() -> None:
         assert settle(world) == (below,)
         assert world.position(above)[2] == pytest.approx(TABLE_HEIGHT + half[1], abs=0.001)
         assert world.speed(above) < RESTING_SPEED
+
+
+def test_packed_objects_do_not_touch() -> None:
+    for seed in range(3):
+        with World() as world:
+            scene = make_scene(world, "packed", [CUBE], np.random.default_rng(seed), scale_range=(1.3, 1.5))
+            bodies = [item.body_id for item in scene.placed]
+            assert len(bodies) >= 2
+            for number, body in enumerate(bodies):
+                for other in bodies[:number]:
+                    assert (world.distance(body, other, limit=0.5) or 0.0) > 0
+
+
+def test_what_never_rests_is_waited_for_as_long_as_the_limit_says(monkeypatch: pytest.MonkeyPatch) -> None:
+    with World() as world:
+        make_scene(world, "packed", [CUBE], np.random.default_rng(1), num_objects=1)
+        steps: list[int] = []
+        monkeypatch.setattr(World, "step", lambda _world, count=1: steps.append(count))
+        monkeypatch.setattr(World, "speed", lambda _world, _body: 2 * RESTING_SPEED)
+        settle(world, limit=1.0)
+        assert sum(steps) * TIMESTEP == pytest.approx(1.0)
+        steps.clear()
+        monkeypatch.setattr(World, "speed", lambda _world, _body: 0.5 * RESTING_SPEED)
+        settle(world, limit=1.0)
+        assert sum(steps) * TIMESTEP < 0.5
