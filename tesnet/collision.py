@@ -1,9 +1,12 @@
-"""The hand's volume, swept along its approach, against the observed cloud and, on request, against what it hides.
+"""The hand's volume, swept along its approach, against what was seen, what may go on unseen and what is hidden.
 
-Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
+`blocked` is the one judgement of it, the predictor's and that of the training's labels. Vectorised torch; lengths in
+metres; everything in the cloud's canonical frame.
 """
 
 from __future__ import annotations
+
+from typing import Literal
 
 import torch
 from torch import Tensor
@@ -11,6 +14,9 @@ from torch import Tensor
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Extent, Gripper, Part
 from tesnet.visibility import depth_behind
+
+APPROACH_DISTANCE = 0.05
+"""Length of the straight approach that is kept clear of observed points, metres."""
 
 SHADOW_MARGIN = 0.01
 """A place is hidden when it lies this far behind the surface that covers it."""
@@ -23,6 +29,29 @@ REACH_BEYOND = 0.04
 
 _BLOCK = 4_000_000
 _COARSE_STRIDE = 6
+
+
+def blocked(
+    cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, unseen: Literal["free", "occupied"]
+) -> Tensor:
+    """Mask (C,): the open hand meets an observed point on its way, or what a side of the workspace cuts off.
+
+    The latter is a guess, which counts only while it leaves a candidate.
+
+    Args:
+        cloud: what was observed.
+        Ts_canonical_grasp: (C, 4, 4) TCP poses.
+        gripper: the hand.
+        unseen: whether the shadow behind observed points counts as `free` or `occupied`.
+    """
+    width = gripper.max_width
+    mask = in_collision(cloud.points, Ts_canonical_grasp, gripper, width, APPROACH_DISTANCE)
+    unsafe = in_collision(beyond(cloud), Ts_canonical_grasp, gripper, width, APPROACH_DISTANCE)
+    if not bool((mask | unsafe).all()):
+        mask |= unsafe
+    if unseen == "occupied":
+        mask |= in_shadow(cloud, Ts_canonical_grasp, gripper, width)
+    return mask
 
 
 def in_collision(

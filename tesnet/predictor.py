@@ -21,9 +21,6 @@ from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 COARSEST_RESOLUTION = 0.0005
 """Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
 
-APPROACH_DISTANCE = 0.05
-"""Length of the straight approach that is kept clear of observed points, metres."""
-
 GOOD_SCORE = 0.9
 """While the best score is lower, other candidates are searched for."""
 
@@ -158,7 +155,7 @@ class GraspPredictor:
 
     def _search(self, prepared: cloud.PreparedCloud, query: GraspQuery) -> _Found:
         found, rejected = candidates.generate(prepared, query, self._candidates)
-        blocked = self._blocked(prepared, found, query)
+        blocked = collision.blocked(prepared, found.Ts_canonical_grasp, query.gripper, query.unseen)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
 
     def _encode(self, proposals: Sequence[_Proposal]) -> list[Any]:
@@ -217,17 +214,6 @@ class GraspPredictor:
         scores = torch.sigmoid(a * self._network.score(features, prepared, found.free) + b)
         self._synchronise()
         return scores
-
-    def _blocked(self, prepared: cloud.PreparedCloud, found: candidates.Candidates, query: GraspQuery) -> torch.Tensor:
-        poses, hand = found.Ts_canonical_grasp, query.gripper
-        blocked = collision.in_collision(prepared.points, poses, hand, hand.max_width, APPROACH_DISTANCE)
-        places = collision.beyond(prepared)
-        unsafe = collision.in_collision(places, poses, hand, hand.max_width, APPROACH_DISTANCE)
-        if not bool((blocked | unsafe).all()):  # a guess must not leave nothing
-            blocked |= unsafe
-        if query.unseen == "occupied":
-            blocked |= collision.in_shadow(prepared, poses, hand, hand.max_width)
-        return blocked
 
     def _synchronise(self) -> None:
         if self.device.type == "cuda":  # or a stage's work would be counted in a later one

@@ -24,14 +24,15 @@ from simharness.play.crew import Emit, Work, crew
 from simharness.sim.camera import PRESET_NOISE, Preset, observe_from, sample_camera
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcomes import OUTCOME_KINDS
+from simharness.sim.protocol import query_about
 from simharness.sim.scene import restore_scene
 from simharness.sim.world import World
 from tesnet import cloud
 from tesnet.candidates import grasp_poses
 from tesnet.cloud import nearest_neighbours
+from tesnet.collision import blocked
 from tesnet.geometry import Pose
 from tesnet.whole_file import whole_file
-from training.generate import is_free, observed_query
 from training.views import (
     LabelledView,
     LabelsError,
@@ -382,7 +383,8 @@ def _render_view(
     preset: Preset = "random" if len(view.Ts_world_camera) == 1 else "multi3"
     cameras = [Pose.from_matrix(matrix) for matrix in view.Ts_world_camera]
     observation = observe_from(world, cameras, rng, PRESET_NOISE[preset])
-    prepared = cloud.prepare(observed_query(observation), preparation, torch.device("cpu"))
+    query = query_about(observation)
+    prepared = cloud.prepare(query, preparation, torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     pairs = torch.tensor(_moved(prepared.T_cloud_canonical.inverse(), view.pairs)).float()
@@ -398,5 +400,6 @@ def _render_view(
         scene=kind,
     )
     if view.collision_free is None:
-        return replace(shown, collision_free=is_free(prepared, shown.candidates))
+        poses = shown.candidates.Ts_canonical_grasp
+        return replace(shown, collision_free=~blocked(prepared, poses, query.gripper, query.unseen))
     return replace(shown, collision_free=torch.from_numpy(view.collision_free.copy())[near])

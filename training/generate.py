@@ -29,14 +29,13 @@ from simharness.sim.execute import label_strict, snapshot_of
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcomes import OUTCOME_KINDS
-from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT, describe, make_scene
+from simharness.sim.protocol import query_about
+from simharness.sim.scene import describe, make_scene
 from simharness.sim.world import World
 from tesnet import candidates, cloud, networks
-from tesnet.collision import in_collision
+from tesnet.collision import blocked
 from tesnet.geometry import PANDA
 from tesnet.networks import Network
-from tesnet.predictor import APPROACH_DISTANCE
-from tesnet.query import GraspQuery
 from tesnet.whole_file import write_whole
 from training.views import LabelledView, LabelsError, count_outcomes, pairs_of, save_scene, scene_files
 
@@ -232,23 +231,6 @@ def _rng(config: GenerateConfig, *numbers: int) -> np.random.Generator:
     return np.random.default_rng([config.seed, 0 if config.scene == "packed" else 1, *numbers])
 
 
-def observed_query(observation: Observation, seed: int = 0) -> GraspQuery:
-    """What the harness would ask about an observation."""
-    return GraspQuery(
-        observation.points_world,
-        viewpoints=observation.viewpoints,
-        up=np.array([0.0, 0.0, 1.0]),
-        workspace=PERCEPTION_BOX,
-        support_height=TABLE_HEIGHT,
-        seed=seed,
-    )
-
-
-def is_free(prepared: cloud.PreparedCloud, found: candidates.Candidates) -> torch.Tensor:
-    """Mask (C,) of the candidates that the observed cloud leaves free, as the predictor finds them."""
-    return ~in_collision(prepared.points, found.Ts_canonical_grasp, PANDA, PANDA.max_width, APPROACH_DISTANCE)
-
-
 def _label_view(
     world: World,
     hand: Hand,
@@ -257,12 +239,12 @@ def _label_view(
     rng: np.random.Generator,
     network: Network | None,
 ) -> LabelledView | None:
-    query = observed_query(observation, seed=int(rng.integers(2**31)))
+    query = query_about(observation, seed=int(rng.integers(2**31)))
     prepared = cloud.prepare(query, cloud.PreparationConfig(), torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
-    free = is_free(prepared, found)
+    free = ~blocked(prepared, found.Ts_canonical_grasp, query.gripper, query.unseen)
     chosen = _choose(prepared, found, free, config, rng, network)
     if len(chosen) == 0:
         return None
@@ -293,9 +275,9 @@ def _choose(
     """Indices of the candidates to try, in order: free ones and some that collide with the observed cloud."""
     if config.colliding_share is None:
         return np.sort(rng.permutation(len(found))[: config.labels_per_view])
-    clear, blocked = (np.flatnonzero(mask.numpy()) for mask in (free, ~free))
-    chosen_blocked = rng.permutation(blocked)[: round(config.labels_per_view * config.colliding_share)]
-    num_clear = config.labels_per_view - len(chosen_blocked)
+    clear, colliding = (np.flatnonzero(mask.numpy()) for mask in (free, ~free))
+    chosen_colliding = rng.permutation(colliding)[: round(config.labels_per_view * config.colliding_share)]
+    num_clear = config.labels_per_view - len(chosen_colliding)
     mined = np.empty(0, dtype=np.int64)
     if network is not None and len(clear):
         with torch.inference_mode():
@@ -303,4 +285,4 @@ def _choose(
         best = clear[logits.argsort(descending=True)[: math.ceil(len(clear) / 4)].numpy()]
         mined = rng.permutation(best)[: num_clear // 2]
     others = rng.permutation(np.setdiff1d(clear, mined))[: num_clear - len(mined)]
-    return np.sort(np.concatenate([mined, others, chosen_blocked]))
+    return np.sort(np.concatenate([mined, others, chosen_colliding]))

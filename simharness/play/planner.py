@@ -11,19 +11,18 @@ from types import TracebackType
 from typing import TYPE_CHECKING, Any
 
 import httpx
-import numpy as np
 
 from client import GraspClient, GraspClientError
 from simharness.errors import RunBroken, UsageError
 from simharness.play.records import ModelRecord
 from simharness.play.round import Plan
 from simharness.sim.camera import Observation
-from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT
+from simharness.sim.protocol import query_about
+from tesnet.query import GraspQuery
 
 if TYPE_CHECKING:
     from typing_extensions import Self
 
-UP = (0.0, 0.0, 1.0)
 REQUEST_TIMEOUT_S = 60.0
 
 
@@ -70,16 +69,10 @@ class HttpPlanner:
         if not len(observation.points_world):
             return Plan.nothing("no_points_in_workspace")
         start = time.perf_counter()
+        options = _options(query_about(observation, seed))
         try:
             reply = self._client.grasps(
-                observation.points_world,
-                viewpoint=np.asarray(observation.viewpoints).tolist(),
-                up=UP,
-                support_height=TABLE_HEIGHT,
-                workspace={"min": PERCEPTION_BOX.minimum, "max": PERCEPTION_BOX.maximum},
-                max_grasps=self._max_grasps,
-                seed=seed,
-                model=self._model,
+                observation.points_world, **options, max_grasps=self._max_grasps, model=self._model
             )
         except GraspClientError as error:
             raise RunBroken(f"the service at {self._url} gave no answer: {error}") from error
@@ -105,3 +98,15 @@ class HttpPlanner:
             )
         entry = networks[self._model]
         return ModelRecord(entry["name"], entry["version"], entry["weights_sha256"]), document
+
+
+def _options(query: GraspQuery) -> dict[str, Any]:
+    """What a query of the protocol tells of its cloud, by the names of the wire."""
+    box = query.workspace
+    return {
+        "viewpoint": query.viewpoints,
+        "up": query.up,
+        "support_height": query.support_height,
+        "workspace": None if box is None else {"min": box.minimum, "max": box.maximum},
+        "seed": query.seed,
+    }

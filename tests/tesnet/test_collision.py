@@ -122,6 +122,47 @@ def test_points_are_expressed_in_every_grasps_frame() -> None:
     np.testing.assert_allclose(found, expected, atol=1e-12)
 
 
+# What a side of the workspace cuts off
+
+STRIP = np.array([(x, y, 0.0) for x in (-0.008, 0.0, 0.008) for y in (0.096, 0.098, 0.1)])
+SIDE = torch.tensor([[0.0, 1.0, 0.0, 0.1005]])
+"""Of a workspace that ends at y = 0.1005, just beyond the strip of points."""
+
+
+def blocked_beside_the_side(*ys: float) -> list[bool]:
+    """For hands whose TCPs lie at y, level with the strip; fingers close along y."""
+    Ts = np.tile(np.eye(4), (len(ys), 1, 1))
+    Ts[:, 1, 3] = ys
+    found: list[bool] = collision.blocked(
+        bare_cloud(STRIP, sides=SIDE), torch.from_numpy(Ts).float(), PANDA, "free"
+    ).tolist()
+    return found
+
+
+def test_things_that_a_side_cuts_off_go_on_straight_out_of_it() -> None:
+    places = collision.beyond(bare_cloud(STRIP, sides=SIDE)).double().numpy()
+    expected = {(x, round(y + step, 6), 0.0) for x, y, _ in STRIP for step in np.arange(0.005, 0.04, 0.005)}
+    assert {tuple(np.round(place, 6)) for place in places} == expected
+    assert len(collision.beyond(bare_cloud(STRIP))) == 0
+    assert len(collision.beyond(bare_cloud(STRIP - [0.0, 0.01, 0.0], sides=SIDE))) == 0
+
+
+def test_a_finger_that_comes_down_beyond_the_side_is_blocked_and_one_far_off_is_not() -> None:
+    assert blocked_beside_the_side(0.07, -0.2, 0.05) == [True, False, True]  # the last one hits the strip itself
+
+
+def test_what_is_only_guessed_leaves_a_candidate() -> None:
+    assert blocked_beside_the_side(0.07) == [False]
+    assert blocked_beside_the_side(0.07, 0.05) == [False, True]
+
+
+def test_the_shadow_blocks_where_it_counts_as_occupied() -> None:
+    Ts = torch.from_numpy(HAND_ALONG_X[None]).float()
+    Ts[0, 2, 3] = -0.3
+    assert not collision.blocked(bare_cloud(SQUARE, ABOVE[None]), Ts, PANDA, "free").any()
+    assert collision.blocked(bare_cloud(SQUARE, ABOVE[None]), Ts, PANDA, "occupied").all()
+
+
 # The shadow of a square of 20 x 20 cm at z = 0, spacing 4 mm, seen from straight above.
 
 _GRID = np.arange(-0.1, 0.1001, 0.004)

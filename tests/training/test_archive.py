@@ -10,9 +10,11 @@ import pytest
 import torch
 
 from tesnet.cloud import PreparationConfig
+from tesnet.collision import blocked
+from tesnet.geometry import PANDA
 from training.__main__ import main
 from training.archive import _draw, pack, unpack
-from training.generate import GenerateConfig, generate, is_free
+from training.generate import GenerateConfig, generate
 from training.views import LabelledView, LabelsError, load_scene, save_scene, scene_files
 
 pytestmark = pytest.mark.sim
@@ -78,9 +80,9 @@ def surely_free(view: LabelledView) -> tuple[torch.Tensor, torch.Tensor]:
     """What the cloud leaves free, and where that holds however the file rounded the points (half a step of float16)."""
     generator = torch.Generator().manual_seed(0)
     noise = 2e-4 * torch.rand(16, *view.cloud.points.shape, generator=generator) - 1e-4
-    votes = torch.stack(
-        [is_free(replace(view.cloud, points=view.cloud.points + moved), view.candidates) for moved in noise]
-    )
+    poses = view.candidates.Ts_canonical_grasp
+    clouds = [replace(view.cloud, points=view.cloud.points + moved) for moved in noise]
+    votes = torch.stack([~blocked(cloud, poses, PANDA, "free") for cloud in clouds])
     return votes[0], (votes == votes[0]).all(dim=0)
 
 

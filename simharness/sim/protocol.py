@@ -1,0 +1,24 @@
+"""What is asked about an observation: one query, which the harness sends to a service and the training labels.
+
+Knows no service and no network.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from simharness.sim.camera import Observation
+from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT
+from tesnet.query import GraspQuery
+
+
+def query_about(observation: Observation, seed: int = 0) -> GraspQuery:
+    """The cloud of an observation with all that the protocol tells of it; nothing else is changed from the defaults."""
+    return GraspQuery(
+        observation.points_world,
+        viewpoints=observation.viewpoints,
+        up=np.array([0.0, 0.0, 1.0]),
+        workspace=PERCEPTION_BOX,
+        support_height=TABLE_HEIGHT,
+        seed=seed,
+    )
