@@ -12,8 +12,9 @@ import torch
 
 from bench.scene import SUPPORT_HEIGHT, UP, WORKSPACE_MAXIMUM, WORKSPACE_MINIMUM, Scene, five_objects
 from bench.table import processor, table
+from tesnet.geometry import Box
 from tesnet.predictor import GraspPredictor
-from tesnet.query import Box, GraspQuery
+from tesnet.query import GraspQuery
 from tesnet.result import GraspResult
 from tesnet.weights import default_weights
 

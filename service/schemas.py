@@ -13,7 +13,7 @@ from typing import Annotated, Literal
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tesnet.geometry import PANDA, FrameConvention, PartName
-from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS
+from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_SEED, MAX_VIEWPOINTS
 from tesnet.result import Reason
 
 REQUEST_ID = r"[A-Za-z0-9._:/+=-]{1,128}"
@@ -191,7 +191,7 @@ class GraspOptions(RequestPart):
         default="panda",
         description="Axes and origin of `position`, `quaternion_xyzw`, `matrix`: panda, graspnet or contact_graspnet.",
     )
-    seed: int = Field(default=0, ge=0, le=2**63 - 1, description="Makes sampling repeatable, 0 to 2^63 - 1.")
+    seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Makes sampling repeatable, 0 to 2^63 - 1.")
     model: str = Field(default="tesnet", max_length=64, description="One of the networks that `GET /model` lists.")
 
 

@@ -1,7 +1,8 @@
 """Candidate grasps of a prepared cloud: ordered pairs of points, their poses and the cheap geometric masks.
 
-The representation is Edge Grasp Network's (Huang et al. 2023, arXiv 2211.00191, section III), with the limits written
-down in CONVENTIONS.md. Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
+The representation is Edge Grasp Network's (Huang et al. 2023, arXiv 2211.00191, section III); CONVENTIONS.md, "From two
+points to a grasp", has the limits and what was added. Vectorised torch; lengths in metres; everything in the cloud's
+canonical frame.
 """
 
 from __future__ import annotations
@@ -20,11 +21,13 @@ TIP_BEYOND_CONTACT = 0.007
 """How far the fingertips reach past the depth of the contact point."""
 
 _STEEPEST_RISE = 0.95
+"""Contact points of shallow pairs face sideways, if only a little: the cosine of their normal with `up` is less."""
+
 _FARTHEST_ASIDE = 0.005
-"""Of the contact points of shallow pairs: cosine of the normal with `up`, metres beside the middle of the finger."""
+"""Metres; contact points of shallow pairs lie no farther beside the plane in which the fingers close."""
 
 _NEARLY_FARTHEST = 0.7
-"""Spreads points within 1.7 times the width of one by one (1.3 on average), at under 2 ms more for 128 of them."""
+"""Of the distance of the farthest point from those chosen: from here on a point is chosen in the same round."""
 
 _PAIRS_AT_ONCE = 500_000
 """Pairs of points whose offsets are in memory at a time, some 20 MB."""
@@ -99,7 +102,7 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
         candidates, alive, rejected = _search(cloud, query, config, approach_points)
         if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
             break
-        count = min(4 * count, MAX_APPROACH_POINTS)  # time and memory grow with it
+        count = more_approach_points(count)
     if not bool(alive.any()) and cloud.up is not None and cloud.support_height is not None:
         candidates = _straight_down(cloud, cloud.up, config, approach_points)
         alive, _ = _judge(cloud, query, config, candidates)
@@ -108,6 +111,11 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
         chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values
         survivors = survivors[chosen.to(survivors.device)]
     return candidates.select(survivors), rejected
+
+
+def more_approach_points(count: int) -> int:
+    """How many approach points to try where `count` were too few: time and memory grow with it."""
+    return min(4 * count, MAX_APPROACH_POINTS)
 
 
 def _no_candidates(cloud: PreparedCloud) -> Candidates:
@@ -180,8 +188,9 @@ def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
     """Indices (min(count, P),) of points (P, 3) spread evenly, by farthest-point sampling with several points a round.
 
     In a round every chosen point's Voronoi cell offers its point farthest from it, and those are taken that are at
-    least `_NEARLY_FARTHEST` as far as the farthest of all; where fewer are wanted, the farthest ones. Plain
-    farthest-point sampling (Gonzalez 1985) takes one point a round.
+    least `_NEARLY_FARTHEST` times as far as the farthest of all; where fewer are wanted, the farthest ones. Plain
+    farthest-point sampling (Gonzalez 1985) takes one point a round; here fewer rounds leave no point farther than 1.7
+    times as far from the chosen ones (measured for 128 of them).
     """
     chosen = torch.tensor([start], device=points.device)
     distance = (points - points[start]).norm(dim=1)
@@ -257,7 +266,7 @@ def grasp_poses(approach_points: Tensor, contact_points: Tensor, contact_normals
     """TCP poses (C, 4, 4) of pairs of points (C, 3) and the contact points' unit normals (C, 3).
 
     z = d_perp / |d_perp| with d_perp the part of d = p_c - p_a across the normal; y = the normal; the fingertips stop
-    7 mm past the depth of the contact point on the line through p_a (CONVENTIONS.md, "The grasp").
+    7 mm past the depth of the contact point on the line through p_a (CONVENTIONS.md, "From two points to a grasp").
     """
     d = contact_points - approach_points
     d_perp = d - (d * contact_normals).sum(dim=1, keepdim=True) * contact_normals

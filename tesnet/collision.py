@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Extent, Gripper, Part
+from tesnet.points import points_in_grasp_frames
 from tesnet.visibility import depth_behind
 
 APPROACH_DISTANCE = 0.05
@@ -103,14 +104,6 @@ def _extent(extent: Extent, front: float, z: Tensor, share: float) -> Tensor | f
         return share * extent.full
     slope = share * (extent.full - extent.front) / extent.taper
     return ((front - z) * slope + share * extent.front).clamp_(max=share * extent.full)
-
-
-def points_in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
-    """x, y and z, each (C, P), of the points (P, 3) in the grasp frames of the poses (C, 4, 4)."""
-    rotations, origins = poses[:, :3, :3], poses[:, :3, 3]
-    shifts = (origins[:, None, :] @ rotations)[:, 0]
-    x, y, z = (torch.addmm(-shifts[:, axis : axis + 1], rotations[:, :, axis], points.T) for axis in range(3))
-    return x, y, z
 
 
 def beyond(cloud: PreparedCloud) -> Tensor:

@@ -11,7 +11,8 @@ import torch
 from torch import Tensor
 from torch.nn import functional
 
-from tesnet.cloud import PreparedCloud, members_of_cells, nearest_neighbours, sight_axes
+from tesnet.cloud import PreparedCloud
+from tesnet.points import members_of_cells, nearest_neighbours, sight_axes
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -13,9 +13,9 @@ import torch
 
 from tesnet import candidates, cloud, collision, networks, ranking, support, weights
 from tesnet.errors import DeviceError, WeightsError
-from tesnet.geometry import PANDA, GraspSet
+from tesnet.geometry import PANDA, Box, GraspSet
 from tesnet.networks import Network
-from tesnet.query import MAX_APPROACH_POINTS, Box, GraspQuery
+from tesnet.query import MAX_SEED, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 
 COARSEST_RESOLUTION = 0.0005
@@ -120,8 +120,8 @@ class GraspPredictor:
         among the answers in proportion to their prepared points.
         """
         begun = [self._propose(query) for query in queries]
-        features = iter(self._encode([answer for answer in begun if isinstance(answer, _Proposal)]))
-        return [self._rank(answer, next(features)) if isinstance(answer, _Proposal) else answer for answer in begun]
+        features = iter(self._encode([item for item in begun if isinstance(item, _Proposal)]))
+        return [self._answer(item, next(features)) if isinstance(item, _Proposal) else item for item in begun]
 
     def _propose(self, query: GraspQuery) -> _Proposal | GraspResult:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""
@@ -170,25 +170,11 @@ class GraspPredictor:
             proposal.clock.add("network", milliseconds_per_point * len(proposal.prepared))
         return features
 
-    def _rank(self, proposal: _Proposal, features: Any) -> GraspResult:
-        """The proposal's candidates, scored and ranked; others in their place, if only those score well."""
+    def _answer(self, proposal: _Proposal, features: Any) -> GraspResult:
+        """The ranked grasps of the best search for a proposal."""
         query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
         clock.start()
-        found, scores = proposal.found, self._scores(features, prepared, proposal.found)
-        clock.lap("network")
-        for number in range(1, FURTHER_SEARCHES + 1):
-            # Where a search yields few candidates it has tried every approach point.
-            if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates:
-                break
-            other = self._search(prepared, _further(query, number))
-            self._synchronise()
-            clock.lap("candidates")
-            if len(other.free):
-                other_scores = self._scores(features, prepared, other)
-                if float(other_scores.max()) > float(scores.max()):
-                    found, scores = other, other_scores
-                clock.lap("network")
-
+        found, scores = self._best_search(proposal, features)
         ranked = ranking.rank(
             scores,
             found.free.Ts_canonical_grasp,
@@ -208,6 +194,28 @@ class GraspPredictor:
             warnings=tuple(proposal.notes),
             timings_ms=clock.laps_ms,
         )
+
+    def _best_search(self, proposal: _Proposal, features: Any) -> tuple[_Found, torch.Tensor]:
+        """The search that holds the best score, of the proposal's and, while that scores no candidate well, of others.
+
+        With the scores (C,) of its free candidates.
+        """
+        query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
+        found, scores = proposal.found, self._scores(features, prepared, proposal.found)
+        clock.lap("network")
+        for number in range(1, FURTHER_SEARCHES + 1):
+            # Where a search yields few candidates it has tried every approach point.
+            if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates:
+                break
+            other = self._search(prepared, _further(query, number))
+            self._synchronise()
+            clock.lap("candidates")
+            if len(other.free):
+                other_scores = self._scores(features, prepared, other)
+                if float(other_scores.max()) > float(scores.max()):
+                    found, scores = other, other_scores
+                clock.lap("network")
+        return found, scores
 
     def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Found) -> torch.Tensor:
         a, b = self._calibration
@@ -275,8 +283,8 @@ class _Proposal:
 
 def _further(query: GraspQuery, number: int) -> GraspQuery:
     """The query, for its further search of this number."""
-    count = min(4 * query.num_approach_points, MAX_APPROACH_POINTS)
-    return replace(query, num_approach_points=count, seed=(query.seed + number * _SEED_STEP) % 2**63)
+    count = candidates.more_approach_points(query.num_approach_points)
+    return replace(query, num_approach_points=count, seed=(query.seed + number * _SEED_STEP) % (MAX_SEED + 1))
 
 
 def configuration_of(network: Network) -> dict[str, dict[str, Any]]:

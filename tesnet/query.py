@@ -1,4 +1,7 @@
-"""What one asks of the predictor: a point cloud and the options of the wire, checked once at this edge. numpy only."""
+"""What one asks of the predictor: a point cloud and what is wanted of its grasps, checked once at this edge.
+
+What the service sees to by itself, such as `frame_convention`, is no part of it. numpy only.
+"""
 
 from __future__ import annotations
 
@@ -10,87 +13,17 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tesnet.errors import InvalidQuery
-from tesnet.geometry import PANDA, Gripper
+from tesnet.geometry import PANDA, Box, Gripper
 
 MAX_GRASPS = 1000
 MAX_APPROACH_POINTS = 1024
 MAX_CANDIDATES = 20_000
 MAX_VIEWPOINTS = 64
+MAX_SEED = 2**63 - 1
 MAX_DIAGONAL = 20.0
 """Metres; a cloud whose central 90 % spans more was not given in metres."""
 MAX_DISTANCE = 1e9
 """Metres from the origin at which viewpoints and support planes still count as given in metres."""
-
-
-def _numbers(field: str, value: ArrayLike) -> NDArray[Any]:
-    try:
-        array = np.asarray(value)
-    except ValueError:  # rows of different lengths
-        array = np.empty(0, dtype=object)
-    if array.dtype.kind not in "biuf":
-        raise InvalidQuery(field, "is no array of real numbers; give x, y, z in metres")
-    return array
-
-
-def _vector(field: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
-    array = np.array(_numbers(field, value), dtype=np.float64)
-    if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
-        wanted = " x ".join("N" if size == -1 else str(size) for size in shape)
-        raise InvalidQuery(field, f"has shape {array.shape}; give an array of {wanted}")
-    if not np.isfinite(array).all():
-        raise InvalidQuery(field, "holds NaN or an infinity; every coordinate must be finite, remove such values")
-    array.setflags(write=False)
-    return array
-
-
-def _direction(field: str, value: ArrayLike) -> NDArray[np.float64]:
-    array = _vector(field, value, (3,))
-    length = math.hypot(*array)  # of what overflows, too
-    if not 1e-6 < length < 1e6:
-        raise InvalidQuery(field, f"has length {length:g}; give a direction whose length is between 1e-6 and 1e6")
-    direction = array / length
-    direction.setflags(write=False)
-    return direction
-
-
-def _in_range(field: str, value: Any, low: float, high: float, unit: str = "") -> None:
-    if not isinstance(value, (int, float, np.number)):
-        raise InvalidQuery(
-            field, f"is of type {type(value).__name__}; give a number between {low:g} and {high:g}{unit}"
-        )
-    if not low <= value <= high:
-        raise InvalidQuery(field, f"is {value:g}; it must lie between {low:g} and {high:g}{unit}")
-
-
-def _whole_in_range(field: str, value: Any, low: int, high: int) -> None:
-    if not isinstance(value, (int, np.integer)) or not low <= value <= high:
-        shown = value if isinstance(value, (int, float, np.number)) else f"of type {type(value).__name__}"
-        raise InvalidQuery(field, f"is {shown}; it must be a whole number between {low} and {high}")
-
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Box:
-    """Axis-aligned box in the cloud frame, metres.
-
-    Args:
-        minimum, maximum: its corners (3,).
-        field: the option that it is given as.
-
-    Raises:
-        InvalidQuery: a minimum that is not below its maximum.
-    """
-
-    minimum: NDArray[np.float64]
-    maximum: NDArray[np.float64]
-    field: Literal["workspace", "target"] = "workspace"
-
-    def __post_init__(self) -> None:
-        for name in ("minimum", "maximum"):
-            object.__setattr__(self, name, _vector(self.field, getattr(self, name), (3,)))
-        if not (self.minimum < self.maximum).all():
-            raise InvalidQuery(
-                self.field, f"min {self.minimum.tolist()} is not below max {self.maximum.tolist()} on every axis"
-            )
 
 
 Target: TypeAlias = Box | NDArray[np.bool_]
@@ -98,20 +31,8 @@ Target: TypeAlias = Box | NDArray[np.bool_]
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class ApproachCone:
-    """Directions of travel that are wanted: within `max_angle_deg` of `direction` (cloud frame, made unit length)."""
-
-    direction: NDArray[np.float64]
-    max_angle_deg: float
-
-    def __post_init__(self) -> None:
-        object.__setattr__(self, "direction", _direction("approach", self.direction))
-        _in_range("approach", self.max_angle_deg, 0, 180, " degrees")
-
-
-@dataclass(frozen=True, eq=False, slots=True)
 class GraspQuery:
-    """A point cloud and what is wanted of its grasps; the names and defaults are those of the HTTP interface.
+    """A point cloud and what is wanted of its grasps; the defaults are those of the HTTP interface.
 
     Args:
         points: (N, 3) metres; stored as float32.
@@ -184,19 +105,33 @@ class GraspQuery:
         _in_range("min_separation", self.separation_rotation_deg, 0, 180, " degrees")
         _whole_in_range("num_approach_points", self.num_approach_points, 1, MAX_APPROACH_POINTS)
         _whole_in_range("max_candidates", self.max_candidates, 1, MAX_CANDIDATES)
-        _whole_in_range("seed", self.seed, 0, 2**63 - 1)
+        _whole_in_range("seed", self.seed, 0, MAX_SEED)
         if self.unseen not in ("free", "occupied"):
             raise InvalidQuery("unseen", f"is {self.unseen!r}; valid: free, occupied")
 
 
-def _mask(target: ArrayLike, count: int) -> NDArray[np.bool_]:
-    mask = np.array(target)
-    if mask.dtype != np.bool_ or mask.shape != (count,):
-        raise InvalidQuery(
-            "target", f"is an array of {mask.dtype} of shape {mask.shape}; give a Box, or a mask of the {count} points"
-        )
-    mask.setflags(write=False)
-    return mask
+@dataclass(frozen=True, eq=False, slots=True)
+class ApproachCone:
+    """Directions of travel that are wanted: within `max_angle_deg` of `direction` (cloud frame, made unit length)."""
+
+    direction: NDArray[np.float64]
+    max_angle_deg: float
+
+    def __post_init__(self) -> None:
+        object.__setattr__(self, "direction", _direction("approach", self.direction))
+        _in_range("approach", self.max_angle_deg, 0, 180, " degrees")
+
+
+def box_option(name: str, minimum: ArrayLike, maximum: ArrayLike) -> Box:
+    """The box between two corners (3,) that the option `name` gives.
+
+    Raises:
+        InvalidQuery: these are no corners of a box; the field is the option.
+    """
+    try:
+        return Box(np.asarray(minimum), np.asarray(maximum))
+    except ValueError as error:
+        raise InvalidQuery(name, str(error)) from None
 
 
 def _cloud(points: ArrayLike) -> NDArray[np.float32]:
@@ -220,3 +155,59 @@ def _cloud(points: ArrayLike) -> NDArray[np.float32]:
             )
     array.setflags(write=False)
     return array
+
+
+def _vector(field: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:
+    array = np.array(_numbers(field, value), dtype=np.float64)
+    if array.ndim != len(shape) or any(want not in (-1, have) for want, have in zip(shape, array.shape, strict=True)):
+        wanted = " x ".join("N" if size == -1 else str(size) for size in shape)
+        raise InvalidQuery(field, f"has shape {array.shape}; give an array of {wanted}")
+    if not np.isfinite(array).all():
+        raise InvalidQuery(field, "holds NaN or an infinity; every coordinate must be finite, remove such values")
+    array.setflags(write=False)
+    return array
+
+
+def _direction(field: str, value: ArrayLike) -> NDArray[np.float64]:
+    array = _vector(field, value, (3,))
+    length = math.hypot(*array)  # of what overflows, too
+    if not 1e-6 < length < 1e6:
+        raise InvalidQuery(field, f"has length {length:g}; give a direction whose length is between 1e-6 and 1e6")
+    direction = array / length
+    direction.setflags(write=False)
+    return direction
+
+
+def _numbers(field: str, value: ArrayLike) -> NDArray[Any]:
+    try:
+        array = np.asarray(value)
+    except ValueError:  # rows of different lengths
+        array = np.empty(0, dtype=object)
+    if array.dtype.kind not in "biuf":
+        raise InvalidQuery(field, "is no array of real numbers; give x, y, z in metres")
+    return array
+
+
+def _mask(target: ArrayLike, count: int) -> NDArray[np.bool_]:
+    mask = np.array(target)
+    if mask.dtype != np.bool_ or mask.shape != (count,):
+        raise InvalidQuery(
+            "target", f"is an array of {mask.dtype} of shape {mask.shape}; give a Box, or a mask of the {count} points"
+        )
+    mask.setflags(write=False)
+    return mask
+
+
+def _in_range(field: str, value: Any, low: float, high: float, unit: str = "") -> None:
+    if not isinstance(value, (int, float, np.number)):
+        raise InvalidQuery(
+            field, f"is of type {type(value).__name__}; give a number between {low:g} and {high:g}{unit}"
+        )
+    if not low <= value <= high:
+        raise InvalidQuery(field, f"is {value:g}; it must lie between {low:g} and {high:g}{unit}")
+
+
+def _whole_in_range(field: str, value: Any, low: int, high: int) -> None:
+    if not isinstance(value, (int, np.integer)) or not low <= value <= high:
+        shown = value if isinstance(value, (int, float, np.number)) else f"of type {type(value).__name__}"
+        raise InvalidQuery(field, f"is {shown}; it must be a whole number between {low} and {high}")

@@ -10,7 +10,8 @@ from dataclasses import dataclass, replace
 import torch
 from torch import Tensor
 
-from tesnet.cloud import crop, voxel_downsample
+from tesnet.cloud import crop
+from tesnet.points import voxel_downsample
 from tesnet.query import GraspQuery
 
 CELL = 0.005

@@ -8,7 +8,8 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
-from tesnet.cloud import PreparedCloud, sight_axes
+from tesnet.cloud import PreparedCloud
+from tesnet.points import sight_axes
 
 _PIXEL = 0.006
 """Width of a pixel at the cloud's distance, metres: somewhat more than the spacing of prepared points."""

@@ -29,9 +29,9 @@ from simharness.sim.scene import restore_scene
 from simharness.sim.world import World
 from tesnet import cloud
 from tesnet.candidates import grasp_poses
-from tesnet.cloud import nearest_neighbours
 from tesnet.collision import blocked
 from tesnet.geometry import Pose
+from tesnet.points import nearest_neighbours
 from tesnet.whole_file import whole_file
 from training.views import (
     LabelledView,

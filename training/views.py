@@ -15,8 +15,9 @@ from numpy.typing import NDArray
 
 from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
-from tesnet.cloud import PreparationConfig, PreparedCloud, orient_normals
+from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import Pose
+from tesnet.points import orient_normals
 from tesnet.whole_file import whole_file
 
 _TODAY = PreparationConfig()

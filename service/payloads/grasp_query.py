@@ -9,7 +9,7 @@ from service.errors import Invalid
 from service.payloads.payload import Payload
 from service.schemas import GraspOptions, GripperSize
 from tesnet.geometry import PANDA, Gripper
-from tesnet.query import ApproachCone, Box, GraspQuery, Target
+from tesnet.query import ApproachCone, GraspQuery, Target, box_option
 
 
 def build_query(payload: Payload, options: GraspOptions) -> GraspQuery:
@@ -26,7 +26,7 @@ def build_query(payload: Payload, options: GraspOptions) -> GraspQuery:
         points=payload.points,
         viewpoints=None if viewpoints is None else viewpoints.reshape(-1, 3),
         up=None if options.up is None else np.array(options.up),
-        workspace=None if workspace is None else Box(np.array(workspace.min), np.array(workspace.max)),
+        workspace=None if workspace is None else box_option("workspace", workspace.min, workspace.max),
         support_height=options.support_height,
         target=_target(payload, options),
         approach=None if approach is None else ApproachCone(np.array(approach.direction), approach.max_angle_deg),
@@ -51,7 +51,7 @@ def _target(payload: Payload, options: GraspOptions) -> Target | None:
     if target is None:
         return None
     if target.box is not None:
-        return Box(np.array(target.box.min), np.array(target.box.max), "target")
+        return box_option("target", target.box.min, target.box.max)
     rows = len(payload.points) if payload.is_point is None else len(payload.is_point)
     indices = np.asarray(target.indices, dtype=np.int64)
     largest = int(indices.max(initial=-1))

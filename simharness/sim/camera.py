@@ -17,8 +17,7 @@ from numpy.typing import NDArray
 from simharness.errors import from_extra
 from simharness.sim.scene import PERCEPTION_BOX, WORKSPACE
 from simharness.sim.world import World
-from tesnet.geometry import CameraIntrinsics, Pose
-from tesnet.query import Box
+from tesnet.geometry import Box, CameraIntrinsics, Pose
 
 Preset = Literal["random", "giga", "multi3", "vgn6"]
 PRESETS: tuple[Preset, ...] = get_args(Preset)

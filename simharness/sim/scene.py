@@ -14,8 +14,7 @@ import numpy as np
 
 from simharness.sim.objects import ObjectModel, SceneKind
 from simharness.sim.world import TIMESTEP, World
-from tesnet.geometry import Pose
-from tesnet.query import Box
+from tesnet.geometry import Box, Pose
 
 TABLE_HEIGHT = 0.05
 WORKSPACE = Box(np.array([0.0, 0.0, 0.0]), np.array([0.3, 0.3, 0.3]))

@@ -1,5 +1,6 @@
-"""Frozen geometric values: poses, cameras, the gripper, grasps. numpy only: a robot's computer needs no more."""
+"""Frozen geometric values: poses, boxes, cameras, the gripper, grasps. numpy only: a robot's computer needs no more."""
 
+from tesnet.geometry.box import Box
 from tesnet.geometry.camera import CameraIntrinsics
 from tesnet.geometry.grasp import FRAME_CONVENTIONS, FrameConvention, GraspSet
 from tesnet.geometry.gripper import HAND_TO_TCP, PANDA, Gripper
@@ -10,6 +11,7 @@ __all__ = [
     "FRAME_CONVENTIONS",
     "HAND_TO_TCP",
     "PANDA",
+    "Box",
     "CameraIntrinsics",
     "Extent",
     "FrameConvention",

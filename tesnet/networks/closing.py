@@ -11,7 +11,7 @@ import torch
 from torch import Tensor
 
 from tesnet.cloud import PreparationConfig, PreparedCloud
-from tesnet.collision import points_in_grasp_frames
+from tesnet.points import points_in_grasp_frames
 
 FINE = PreparationConfig(voxel_size=0.0025, normal_neighbours=40, graph_neighbours=1)
 """Cells of 2.5 mm: with the 4.5 mm of the other networks some sixty points lie between the fingers. Normals are fitted

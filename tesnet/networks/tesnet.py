@@ -17,10 +17,10 @@ from torch import Tensor, nn
 
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
-from tesnet.collision import points_in_grasp_frames
 from tesnet.geometry import PANDA, Gripper
 from tesnet.layers import PointTransformerConv, SAGEConv
 from tesnet.patches import Patches, group, pool
+from tesnet.points import points_in_grasp_frames
 from tesnet.visibility import depth_behind, outside
 
 _POINT_INPUTS = 7
@@ -71,93 +71,6 @@ class CloudFeatures:
     patches: Patches
     wide: Tensor
     context: Tensor
-
-
-class EncoderStage(nn.Module):
-    """PointTransformerConv (eqs. 3-5) followed by GraphSAGE (eqs. 6-8), normalised, with a skip connection."""
-
-    def __init__(self, channels: int) -> None:
-        super().__init__()
-        self.attention = PointTransformerConv(
-            channels,
-            channels,
-            pos_nn=nn.Sequential(nn.Linear(_EDGE_INPUTS, channels), nn.ReLU(), nn.Linear(channels, channels)),
-            attn_nn=nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels)),
-        )
-        self.attention_norm = nn.LayerNorm(channels)
-        self.aggregate = SAGEConv(channels, channels)
-        self.aggregate_norm = nn.LayerNorm(channels)
-
-    def forward(self, x: Tensor, neighbours: Tensor, edges: Tensor) -> Tensor:
-        """Features (P, C) from features (P, C), neighbours (P, k) and edge inputs (P, k, 4)."""
-        attended = torch.relu(self.attention_norm(self.attention(x, neighbours, edges)))
-        return torch.relu(x + self.aggregate_norm(self.aggregate(attended, neighbours)))
-
-
-class RegionPooling(nn.Module):
-    """What lies in a box about each candidate's hand: a shared MLP over the points in it, then the largest of each.
-
-    Args:
-        in_channels: F, features of a point.
-        channels: widths of the MLP.
-        count: at most so many points are looked at; where more lie there, a fixed pseudo-random choice of them.
-        box: half extents along x and y of the grasp frame and extents along -z and +z from the TCP, metres.
-    """
-
-    def __init__(
-        self, in_channels: int, channels: tuple[int, int], count: int, box: tuple[float, float, float, float]
-    ) -> None:
-        super().__init__()
-        self.features = nn.Linear(in_channels, channels[0], bias=False)
-        self.geometry = nn.Linear(_REGION_INPUTS, channels[0])
-        self.update = nn.Linear(channels[0], channels[1])
-        self.count = count
-        self.box = box
-
-    def forward(
-        self, features: Tensor, cloud: PreparedCloud | Patches, poses: Tensor, sign: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Pooled features (C, channels[1]) from features (P, F) of the points, and how many points are there, (C,).
-
-        Args:
-            features: of the cloud's points.
-            cloud: P points with normals.
-            poses: (C, 4, 4) TCP poses.
-            sign: (C,) +1, or -1 to see the surroundings mirrored in the hand's plane.
-        """
-        index, total = self.members(cloud.points, poses)
-        facing = (cloud.normals * cloud.view_directions).sum(dim=1, keepdim=True)
-        table = torch.cat([cloud.points, cloud.normals, facing], dim=1)
-        flat = index.flatten()
-        inputs = table.index_select(0, flat).view(*index.shape, _REGION_INPUTS)
-        gathered = self.features(features).index_select(0, flat).view(*index.shape, self.features.out_features)
-        weight, bias = self._geometry_of(poses, sign)
-        hidden = torch.relu(torch.baddbmm(gathered + bias[:, None], inputs, weight))
-        pooled = torch.relu(self.update(hidden).amax(dim=1))
-        return pooled * (total > 0)[:, None], total
-
-    def _geometry_of(self, poses: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
-        """`geometry` for points and normals that are given in the cloud's frame: weights (C, 7, D) and biases (C, D).
-
-        Turning each candidate's weights is cheaper than turning all points in its box.
-        """
-        rotation = poses[:, :3, :3] * _mirror(sign)[:, None]
-        points, normals, facing = self.geometry.weight.T.split([3, 3, 1])
-        turned = rotation @ (points / _LENGTH)
-        weight = torch.cat([turned, rotation @ normals, facing.expand(len(poses), -1, -1)], dim=1)
-        return weight, self.geometry.bias - (poses[:, None, :3, 3] @ turned)[:, 0]
-
-    def members(self, points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Indices (C, M) of points in each candidate's box, the first repeated where there are fewer; totals (C,)."""
-        shuffled = torch.randperm(len(points), generator=torch.Generator().manual_seed(0)).to(poses.device)
-        x, y, z = points_in_grasp_frames(points[shuffled], poses)
-        breadth, length, behind, ahead = self.box
-        within = (x.abs_() < breadth) & (y.abs_() < length) & (z > -behind) & (z < ahead)
-        rank = within.cumsum(dim=1, dtype=torch.int32)
-        row, column = (within & (rank <= self.count)).nonzero(as_tuple=True)
-        index = shuffled[within.to(torch.uint8).argmax(dim=1)][:, None].repeat(1, self.count)
-        index[row, (rank[row, column] - 1).long()] = shuffled[column]
-        return index, rank[:, -1]
 
 
 class TesNet(nn.Module):
@@ -256,6 +169,93 @@ class TesNet(nn.Module):
         )
         logits: Tensor = self.head(joined)[:, 0]
         return logits
+
+
+class EncoderStage(nn.Module):
+    """PointTransformerConv (eqs. 3-5) followed by GraphSAGE (eqs. 6-8), normalised, with a skip connection."""
+
+    def __init__(self, channels: int) -> None:
+        super().__init__()
+        self.attention = PointTransformerConv(
+            channels,
+            channels,
+            pos_nn=nn.Sequential(nn.Linear(_EDGE_INPUTS, channels), nn.ReLU(), nn.Linear(channels, channels)),
+            attn_nn=nn.Sequential(nn.Linear(channels, channels), nn.ReLU(), nn.Linear(channels, channels)),
+        )
+        self.attention_norm = nn.LayerNorm(channels)
+        self.aggregate = SAGEConv(channels, channels)
+        self.aggregate_norm = nn.LayerNorm(channels)
+
+    def forward(self, x: Tensor, neighbours: Tensor, edges: Tensor) -> Tensor:
+        """Features (P, C) from features (P, C), neighbours (P, k) and edge inputs (P, k, 4)."""
+        attended = torch.relu(self.attention_norm(self.attention(x, neighbours, edges)))
+        return torch.relu(x + self.aggregate_norm(self.aggregate(attended, neighbours)))
+
+
+class RegionPooling(nn.Module):
+    """What lies in a box about each candidate's hand: a shared MLP over the points in it, then the largest of each.
+
+    Args:
+        in_channels: F, features of a point.
+        channels: widths of the MLP.
+        count: at most so many points are looked at; where more lie there, a fixed pseudo-random choice of them.
+        box: half extents along x and y of the grasp frame and extents along -z and +z from the TCP, metres.
+    """
+
+    def __init__(
+        self, in_channels: int, channels: tuple[int, int], count: int, box: tuple[float, float, float, float]
+    ) -> None:
+        super().__init__()
+        self.features = nn.Linear(in_channels, channels[0], bias=False)
+        self.geometry = nn.Linear(_REGION_INPUTS, channels[0])
+        self.update = nn.Linear(channels[0], channels[1])
+        self.count = count
+        self.box = box
+
+    def forward(
+        self, features: Tensor, cloud: PreparedCloud | Patches, poses: Tensor, sign: Tensor
+    ) -> tuple[Tensor, Tensor]:
+        """Pooled features (C, channels[1]) from features (P, F) of the points, and how many points are there, (C,).
+
+        Args:
+            features: of the cloud's points.
+            cloud: P points with normals.
+            poses: (C, 4, 4) TCP poses.
+            sign: (C,) +1, or -1 to see the surroundings mirrored in the hand's plane.
+        """
+        index, total = self.members(cloud.points, poses)
+        facing = (cloud.normals * cloud.view_directions).sum(dim=1, keepdim=True)
+        table = torch.cat([cloud.points, cloud.normals, facing], dim=1)
+        flat = index.flatten()
+        inputs = table.index_select(0, flat).view(*index.shape, _REGION_INPUTS)
+        gathered = self.features(features).index_select(0, flat).view(*index.shape, self.features.out_features)
+        weight, bias = self._geometry_of(poses, sign)
+        hidden = torch.relu(torch.baddbmm(gathered + bias[:, None], inputs, weight))
+        pooled = torch.relu(self.update(hidden).amax(dim=1))
+        return pooled * (total > 0)[:, None], total
+
+    def _geometry_of(self, poses: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
+        """`geometry` for points and normals that are given in the cloud's frame: weights (C, 7, D) and biases (C, D).
+
+        Turning each candidate's weights is cheaper than turning all points in its box.
+        """
+        rotation = poses[:, :3, :3] * _mirror(sign)[:, None]
+        points, normals, facing = self.geometry.weight.T.split([3, 3, 1])
+        turned = rotation @ (points / _LENGTH)
+        weight = torch.cat([turned, rotation @ normals, facing.expand(len(poses), -1, -1)], dim=1)
+        return weight, self.geometry.bias - (poses[:, None, :3, 3] @ turned)[:, 0]
+
+    def members(self, points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
+        """Indices (C, M) of points in each candidate's box, the first repeated where there are fewer; totals (C,)."""
+        shuffled = torch.randperm(len(points), generator=torch.Generator().manual_seed(0)).to(poses.device)
+        x, y, z = points_in_grasp_frames(points[shuffled], poses)
+        breadth, length, behind, ahead = self.box
+        within = (x.abs_() < breadth) & (y.abs_() < length) & (z > -behind) & (z < ahead)
+        rank = within.cumsum(dim=1, dtype=torch.int32)
+        row, column = (within & (rank <= self.count)).nonzero(as_tuple=True)
+        index = shuffled[within.to(torch.uint8).argmax(dim=1)][:, None].repeat(1, self.count)
+        index[row, (rank[row, column] - 1).long()] = shuffled[column]
+        return index, rank[:, -1]
 
 
 def point_inputs(cloud: PreparedCloud) -> Tensor:

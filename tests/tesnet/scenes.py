@@ -10,10 +10,11 @@ import torch
 from numpy.typing import NDArray
 
 from tesnet import cloud
-from tesnet.geometry import Pose
+from tesnet.geometry import Box, Pose
 from tesnet.networks.tesnet import TesNet, TesNetConfig
+from tesnet.points import nearest_neighbours
 from tesnet.predictor import GraspPredictor, ModelInfo, configuration_of
-from tesnet.query import Box, GraspQuery
+from tesnet.query import GraspQuery
 
 Array = NDArray[np.float64]
 
@@ -122,7 +123,7 @@ def bare_cloud(points: Array, viewpoints: Array = CAMERA[None], **fields: Any) -
     given: dict[str, Any] = {
         "points": positions,
         "normals": directions,
-        "neighbours": cloud.nearest_neighbours(positions, 16),
+        "neighbours": nearest_neighbours(positions, 16),
         "spectrum": torch.full((len(positions), 2), 0.1),
         "view_directions": directions,
         "viewpoints": cameras,

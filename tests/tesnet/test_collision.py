@@ -112,16 +112,6 @@ def test_no_candidates_have_no_collisions() -> None:
     assert hits(np.zeros((5, 3)), np.empty((0, 4, 4)), 0.08).shape == (0,)
 
 
-def test_points_are_expressed_in_every_grasps_frame() -> None:
-    rng = np.random.default_rng(0)
-    points = rng.uniform(-0.2, 0.2, (20, 3))
-    motions = [Pose.random(rng, reach=0.5) for _ in range(6)]
-    Ts = torch.from_numpy(np.array([motion.matrix for motion in motions]))
-    found = torch.stack(collision.points_in_grasp_frames(torch.from_numpy(points), Ts), dim=2)
-    expected = np.array([motion.inverse().apply(points) for motion in motions])
-    np.testing.assert_allclose(found, expected, atol=1e-12)
-
-
 # What a side of the workspace cuts off
 
 STRIP = np.array([(x, y, 0.0) for x in (-0.008, 0.0, 0.008) for y in (0.096, 0.098, 0.1)])

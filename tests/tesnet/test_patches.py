@@ -3,8 +3,8 @@ from __future__ import annotations
 import numpy as np
 import torch
 
-from tesnet.cloud import sight_axes
 from tesnet.patches import group, pool
+from tesnet.points import sight_axes
 from tests.tesnet.scenes import prepared, tabletop_query
 
 SIZE = 0.011

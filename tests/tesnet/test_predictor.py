@@ -15,9 +15,9 @@ from scipy.spatial import cKDTree
 from tesnet import cloud, weights
 from tesnet import predictor as predictor_module
 from tesnet.errors import DeviceError, WeightsError
-from tesnet.geometry import PANDA
+from tesnet.geometry import PANDA, Box
 from tesnet.predictor import GraspPredictor, configuration_of
-from tesnet.query import ApproachCone, Box, GraspQuery
+from tesnet.query import ApproachCone, GraspQuery
 from tesnet.result import REJECTIONS, GraspResult
 from tests.tesnet.scenes import (
     CAMERA,

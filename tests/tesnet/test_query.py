@@ -9,7 +9,7 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tesnet.errors import InvalidQuery, TesnetError
-from tesnet.query import ApproachCone, Box
+from tesnet.query import ApproachCone, box_option
 from tests.tesnet.scenes import UP, ask
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
@@ -86,12 +86,13 @@ def test_bad_options_are_refused_with_value_limit_and_remedy(field: str, options
     assert isinstance(caught.value, TesnetError)
 
 
-def test_a_box_must_have_a_volume() -> None:
-    with pytest.raises(InvalidQuery, match=re.escape("min [0.0, 0.0, 0.0] is not below max [1.0, 0.0, 1.0]")):
-        Box(np.zeros(3), np.array([1.0, 0.0, 1.0]))
-    with pytest.raises(InvalidQuery, match="finite") as caught:
-        Box(np.zeros(3), np.array([1.0, np.nan, 1.0]))
-    assert caught.value.field == "workspace"
+@pytest.mark.parametrize("option", ["workspace", "target"])
+def test_what_is_no_box_is_refused_under_its_options_name(option: str) -> None:
+    says = f"{option}: min [0.0, 0.0, 0.0] is not below max [1.0, 0.0, 1.0] on every axis"
+    with pytest.raises(InvalidQuery, match=re.escape(says)) as caught:
+        box_option(option, (0, 0, 0), (1, 0, 1))
+    assert caught.value.field == option
+    np.testing.assert_array_equal(box_option(option, (0, 0, 0), (1, 2, 3)).maximum, [1, 2, 3])
 
 
 @pytest.mark.parametrize("angle", [-1.0, 181.0, float("nan"), float("inf")])

@@ -9,8 +9,8 @@ import pytest
 from numpy.typing import NDArray
 
 from tesnet import support
-from tesnet.geometry import Pose
-from tesnet.query import Box, GraspQuery
+from tesnet.geometry import Box, Pose
+from tesnet.query import GraspQuery
 from tests.tesnet.scenes import CAMERA, CPU, UP, ask, fresh_predictor, tabletop
 
 Array = NDArray[np.float64]

@@ -10,13 +10,13 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tesnet import candidates, cloud, collision
+from tesnet import candidates, collision
 from tesnet.errors import InvalidQuery
-from tesnet.geometry import PANDA, Gripper
-from tesnet.query import Box
+from tesnet.geometry import PANDA, Box, Gripper
+from tesnet.points import voxel_downsample
 from tests.tesnet.scenes import ask, fresh_predictor, prepared, tabletop, tabletop_query
 
-OBJECT = Box(np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.2]), "target")
+OBJECT = Box(np.array([-0.05, -0.05, 0.0]), np.array([0.05, 0.05, 0.2]))
 """Holds the object in the middle of the table, and nothing else."""
 
 
@@ -50,7 +50,7 @@ def test_the_rest_of_the_cloud_still_counts_for_collision() -> None:
 
 
 def test_pairs_that_leave_the_target_are_counted() -> None:
-    half = Box(np.array([-1.0, -1.0, -1.0]), np.array([0.0, 1.0, 1.0]), "target")
+    half = Box(np.array([-1.0, -1.0, -1.0]), np.array([0.0, 1.0, 1.0]))
     query = tabletop_query(target=half, max_candidates=20_000, num_approach_points=1024)
     ready = prepared(query, voxel_size=0.01)
     assert ready.on_target is not None
@@ -75,7 +75,7 @@ def test_everything_as_a_target_changes_nothing() -> None:
     [
         (np.zeros(40_000, dtype=bool), "target has 0 points"),
         (np.arange(40_000) == 700, "target has 1 points"),
-        (Box(np.full(3, 5.0), np.full(3, 6.0), "target"), "target holds none"),
+        (Box(np.full(3, 5.0), np.full(3, 6.0)), "target holds none"),
     ],
 )
 def test_a_target_without_cells_has_no_candidates_and_a_warning(target: Any, says: str) -> None:
@@ -87,7 +87,7 @@ def test_a_target_without_cells_has_no_candidates_and_a_warning(target: Any, say
 
 
 def test_a_cloud_that_is_too_large_is_cut_around_the_target() -> None:
-    far = Box(np.array([0.05, 0.0, 0.0]), np.array([0.15, 0.1, 0.2]), "target")
+    far = Box(np.array([0.05, 0.0, 0.0]), np.array([0.15, 0.1, 0.2]))
     ready = prepared(tabletop_query(target=far), max_points=300)
     assert len(ready) <= 300
     assert ready.on_target is not None
@@ -99,7 +99,7 @@ def test_a_cloud_that_is_too_large_is_cut_around_the_target() -> None:
 def test_a_cell_is_on_target_when_half_of_its_points_are(seed: int, count: int) -> None:
     rng = np.random.default_rng(seed)
     table = np.column_stack([rng.uniform(0, 0.02, (count, 3)), rng.integers(0, 2, count)]).astype(np.float32)
-    cells = cloud.voxel_downsample(torch.from_numpy(table), 0.005).numpy()
+    cells = voxel_downsample(torch.from_numpy(table), 0.005).numpy()
     keys = np.floor((table[:, :3] - table[:, :3].min(axis=0)) / np.float32(0.005) + 0.5).astype(int)
     _, cell = np.unique(keys, axis=0, return_inverse=True)
     shares = [table[cell.ravel() == index, 3].mean() for index in range(cell.max() + 1)]

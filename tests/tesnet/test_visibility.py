@@ -8,7 +8,7 @@ import pytest
 import torch
 
 from tesnet.cloud import PreparedCloud
-from tesnet.query import Box
+from tesnet.geometry import Box
 from tesnet.visibility import depth_behind, outside
 from tests.tesnet.scenes import CAMERA, UP, WORKSPACE, ask, prepared, tabletop
 

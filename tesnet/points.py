@@ -1,0 +1,218 @@
+"""What is done with bare points: voxel grid, neighbours, outliers, normals, and the frames that they are seen in.
+
+Knows no query, no candidate and no hand. Vectorised torch on the device of its inputs; lengths in metres.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+_FEW_POINTS = 700
+"""Up to so many points are compared with each other, all with all."""
+
+_SLAB_QUERIES = 192
+_SLAB_MARGIN = 0.02
+"""Of more points, so many queries at a time are compared with the points that lie at most so far from them along x."""
+
+_LARGEST_TABLE = 4_000_000
+"""Distances that are in memory at a time, at most."""
+
+
+def voxel_downsample(points: Tensor, voxel_size: float) -> Tensor:
+    """The mean of the rows (N, 3 or more), which begin with x, y, z, in every occupied cell, in the order of the cells.
+
+    The grid's corner lies half a cell below the smallest coordinates, as in Open3D.
+    """
+    corner = points[:, :3].min(dim=0).values
+    cells = ((points[:, :3] - corner) / voxel_size + 0.5).floor().long()
+    cell_of_point, counts = members_of_cells(cells)
+    sums = torch.zeros(len(counts), points.shape[1], dtype=torch.float64, device=points.device)
+    sums.index_add_(0, cell_of_point, points.double())
+    means: Tensor = (sums / counts[:, None]).to(points.dtype)
+    return means
+
+
+def members_of_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
+    """Of integer cells (P, 3): the number (P,) of each row among the occupied cells, in order, and their sizes."""
+    cells = cells - cells.min(dim=0).values
+    extent = cells.max(dim=0).values + 1
+    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+    _, member_of, counts = keys.unique(return_inverse=True, return_counts=True)
+    return member_of, counts
+
+
+def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) -> Tensor:
+    """Indices (Q, k) of the points (P, 3) nearest to each query (Q, 3), nearest first.
+
+    Queries default to the points themselves; each is then its own first neighbour. With fewer than k points the last
+    one is repeated.
+
+    Points and queries are sorted along x, and a block of queries is compared with the slab of points around it only;
+    the few queries whose k-th neighbour may lie outside the slab, and all queries of few points, are compared with all.
+    """
+    sources = points if queries is None else queries
+    available = min(k, len(points))
+    # Squared distances come from an expanded square, whose terms cancel: float64.
+    exact, wanted = points.double(), sources.double()
+    by_x, order = exact[:, 0].sort()
+    sorted_points = exact[order]
+    query_order = wanted[:, 0].argsort()
+    neighbours = torch.empty(len(sources), available, dtype=torch.long, device=points.device)
+    few = len(points) <= _FEW_POINTS
+    unsure = [query_order] if few else []
+    for rows in () if few else query_order.split(_SLAB_QUERIES):
+        block = wanted[rows]
+        ends = torch.stack([block[0, 0] - _SLAB_MARGIN, block[-1, 0] + _SLAB_MARGIN])
+        first, last = torch.searchsorted(by_x, ends).tolist()
+        if last - first < available:
+            unsure.append(rows)
+            continue
+        squares, found = _nearest(block, sorted_points[first:last], available)
+        neighbours[rows] = order[found + first]
+        unsure.append(rows[squares[:, -1] >= _SLAB_MARGIN**2])
+    for rows in torch.cat(unsure).split(max(1, _LARGEST_TABLE // len(points))) if unsure else ():
+        neighbours[rows] = _nearest(wanted[rows], exact, available)[1]
+    if queries is None:
+        neighbours = _self_first(neighbours)
+    return neighbours if available == k else torch.cat([neighbours, neighbours[:, -1:].expand(-1, k - available)], 1)
+
+
+def _nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Squared distances and indices (Q, k) of the nearest points, both in ascending order of distance."""
+    # |q - p|^2 = [q, |q|^2, 1] . [-2 p, 1, |p|^2]; only the sum is small enough for float32.
+    left = torch.cat([queries, queries.square().sum(dim=1, keepdim=True), torch.ones_like(queries[:, :1])], dim=1)
+    right = torch.cat([-2 * points, torch.ones_like(points[:, :1]), points.square().sum(dim=1, keepdim=True)], dim=1)
+    nearest = (left @ right.T).float().topk(k, largest=False)
+    return nearest.values, nearest.indices
+
+
+def _self_first(neighbours: Tensor) -> Tensor:
+    """Puts each row's own index first; coincident points may otherwise come before it or crowd it out."""
+    own = torch.arange(len(neighbours), device=neighbours.device)
+    position = torch.where(neighbours == own[:, None], 0, 1)
+    order = position.sort(dim=1, stable=True).indices
+    neighbours = neighbours.gather(1, order)
+    neighbours[:, 0] = own
+    return neighbours
+
+
+def statistical_outliers(points: Tensor, neighbours: Tensor, std_ratio: float) -> Tensor:
+    """Mask (P,) of points whose mean distance to their neighbours (P, k), themselves included, is unusually large.
+
+    Unusual is above mean + std_ratio * standard deviation over the cloud (as Open3D's remove_statistical_outlier).
+    """
+    mean_distances = (points[neighbours] - points[:, None]).norm(dim=2).mean(dim=1)
+    if len(points) < 2:
+        return torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    outliers: Tensor = mean_distances > mean_distances.mean() + std_ratio * mean_distances.std()
+    return outliers
+
+
+def drop_points(points: Tensor, neighbours: Tensor, keep: Tensor) -> tuple[Tensor, Tensor]:
+    """Points (P', 3) and exact neighbours (P', k) after dropping the points where `keep` (P,) is false.
+
+    Only rows that had a dropped neighbour are searched again.
+    """
+    if bool(keep.all()):
+        return points, neighbours
+    new_index = keep.cumsum(0) - 1
+    kept_points, kept_neighbours = points[keep], neighbours[keep]
+    stale = (~keep[kept_neighbours]).any(dim=1)
+    renumbered = new_index[kept_neighbours]
+    if len(kept_points) < neighbours.shape[1]:
+        return kept_points, nearest_neighbours(kept_points, neighbours.shape[1])
+    if bool(stale.any()):
+        fresh = nearest_neighbours(kept_points, neighbours.shape[1], kept_points[stale])
+        own = stale.nonzero()[:, 0]
+        moved = torch.where(fresh == own[:, None], 0, 1).sort(dim=1, stable=True).indices
+        fresh = fresh.gather(1, moved)
+        fresh[:, 0] = own
+        renumbered[stale] = fresh
+    return kept_points, renumbered
+
+
+def estimate_normals(points: Tensor, neighbours: Tensor, radius: float) -> tuple[Tensor, Tensor]:
+    """Unit normals (P, 3) of unknown sign and spectra (P, 2), fitted to the neighbours (P, k) within `radius`.
+
+    The normal is the eigenvector of the smallest eigenvalue of the neighbours' covariance, found in closed form; the
+    spectrum is (smallest, middle) / sum of the eigenvalues.
+    """
+    offsets = (points[neighbours] - points[:, None]).double()
+    weights = (offsets.square().sum(dim=2) <= radius * radius).double()
+    total = weights.sum(dim=1).clamp(min=1)
+    mean = (offsets * weights[..., None]).sum(dim=1) / total[:, None]
+    centred = (offsets - mean[:, None]) * weights[..., None]
+    covariance = centred.transpose(1, 2) @ centred / total[:, None, None]
+    eigenvalues, normals = smallest_eigenvector(covariance)
+    spectrum = eigenvalues[:, :2] / eigenvalues.sum(dim=1, keepdim=True).clamp(min=1e-18)
+    return normals.to(points.dtype), spectrum.to(points.dtype)
+
+
+def orient_normals(points: Tensor, normals: Tensor, viewpoints: Tensor) -> tuple[Tensor, Tensor]:
+    """Normals (P, 3) turned towards, and unit directions (P, 3) to, the viewpoint (of V, 3) most nearly along each."""
+    to_viewpoints = viewpoints[None] - points[:, None]
+    directions = to_viewpoints / to_viewpoints.norm(dim=2, keepdim=True).clamp(min=1e-9)
+    alignment = (directions * normals[:, None]).sum(dim=2)
+    best = alignment.abs().argmax(dim=1)
+    rows = torch.arange(len(points), device=points.device)
+    sign = torch.where(alignment[rows, best] < 0, -1.0, 1.0)
+    return normals * sign[:, None], directions[rows, best]
+
+
+def smallest_eigenvector(symmetric: Tensor) -> tuple[Tensor, Tensor]:
+    """Ascending eigenvalues (B, 3) and the unit eigenvector (B, 3) of the smallest, of symmetric matrices (B, 3, 3).
+
+    Eigenvalues by the trigonometric solution of the characteristic polynomial (Smith 1961, "Eigenvalues of a
+    symmetric 3 x 3 matrix"); the eigenvector is the longest cross product of two rows of A - lambda I. Where the
+    smallest eigenvalue is not distinct, it is some unit vector of its eigenspace.
+    """
+    identity = torch.eye(3, dtype=symmetric.dtype, device=symmetric.device)
+    scale = symmetric.abs().amax(dim=(1, 2)).clamp(min=torch.finfo(symmetric.dtype).tiny)
+    a = symmetric / scale[:, None, None]
+    mean = a.diagonal(dim1=1, dim2=2).mean(dim=1)
+    deviator = a - mean[:, None, None] * identity
+    p = (deviator.square().sum(dim=(1, 2)) / 6).sqrt().clamp(min=1e-150)
+    half_determinant = (torch.linalg.det(deviator / p[:, None, None]) / 2).clamp(-1, 1)
+    angle = half_determinant.acos() / 3
+    turns = torch.tensor([2.0, 4.0, 0.0], dtype=a.dtype, device=a.device) * (torch.pi / 3)
+    eigenvalues = mean[:, None] + 2 * p[:, None] * torch.cos(angle[:, None] + turns)
+    eigenvalues = eigenvalues.sort(dim=1).values
+    shifted = a - eigenvalues[:, :1, None] * identity
+    products = torch.linalg.cross(shifted, shifted[:, [1, 2, 0]], dim=2)
+    lengths = products.norm(dim=2)
+    best = lengths.argmax(dim=1)
+    rows = torch.arange(len(a), device=a.device)
+    vector, length = products[rows, best], lengths[rows, best]
+    # With two equal eigenvalues every row is a multiple of the third eigenvector, and any vector across it is right.
+    row = shifted[rows, shifted.norm(dim=2).argmax(dim=1)]
+    across = torch.linalg.cross(row, identity[row.abs().argmin(dim=1)], dim=1)
+    across_length = across.norm(dim=1)
+    fallback = torch.where(
+        (across_length < 1e-14)[:, None], identity[2], across / across_length.clamp(min=1e-300)[:, None]
+    )
+    vector = torch.where((length < 1e-14)[:, None], fallback, vector / length.clamp(min=1e-300)[:, None])
+    return eigenvalues.clamp(min=0) * scale[:, None], vector
+
+
+def sight_axes(points: Tensor, viewpoint: Tensor) -> Tensor:
+    """(3, 3) axes, as columns, that move with points (P, 3) and their viewpoint (3,): z points away from the viewer.
+
+    z goes from the viewpoint to the points' centroid; x from there towards the point farthest across z.
+    """
+    rays = points - points.mean(dim=0)
+    z = torch.nn.functional.normalize(points.mean(dim=0) - viewpoint, dim=0)
+    across = rays - (rays @ z)[:, None] * z
+    x = across[across.norm(dim=1).argmax()]
+    if float(x.norm()) < 1e-6:  # all in one line of sight
+        x = torch.linalg.cross(z, torch.eye(3, dtype=points.dtype, device=points.device)[z.abs().argmin()])
+    x = torch.nn.functional.normalize(x, dim=0)
+    return torch.stack([x, torch.linalg.cross(z, x), z], dim=1)
+
+
+def points_in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and z, each (C, P), of the points (P, 3) in the grasp frames of the poses (C, 4, 4)."""
+    rotations, origins = poses[:, :3, :3], poses[:, :3, 3]
+    shifts = (origins[:, None, :] @ rotations)[:, 0]
+    x, y, z = (torch.addmm(-shifts[:, axis : axis + 1], rotations[:, :, axis], points.T) for axis in range(3))
+    return x, y, z
