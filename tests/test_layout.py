@@ -8,15 +8,17 @@ import pytest
 
 ROOT = Path(__file__).resolve().parents[1]
 
-COMMANDS = {
+ELSEWHERE = {
     "service/__main__.py": "tests/service/test_process.py",
     "client/__main__.py": "tests/client/test_command.py",
     "simharness/__main__.py": "tests/simharness/test_cli.py",
+    "training/__main__.py": "tests/training/test_command.py",
+    "tesnet/result.py": "tests/tesnet/test_predictor.py",
 }
-"""What `python -m` starts is tested as its user meets it."""
+"""What `python -m` starts is tested as its user meets it, and an answer by what fills it."""
 
 
-@pytest.mark.parametrize("package", ["client", "service", "simharness"])
+@pytest.mark.parametrize("package", ["client", "service", "simharness", "tesnet", "training"])
 def test_every_module_has_a_test_file_of_its_name_or_of_its_package(package: str) -> None:
     modules = [path.relative_to(ROOT) for path in sorted((ROOT / package).rglob("*.py")) if path.name != "__init__.py"]
     assert modules
@@ -24,7 +26,7 @@ def test_every_module_has_a_test_file_of_its_name_or_of_its_package(package: str
     for module in modules:
         own = ROOT / "tests" / module.parent / f"test_{module.name}"
         of_its_package = ROOT / "tests" / module.parent.parent / f"test_{module.parent.name}.py"
-        command = ROOT / COMMANDS.get(module.as_posix(), "none")
-        if not (own.exists() or of_its_package.exists() or command.exists()):
+        elsewhere = ROOT / ELSEWHERE.get(module.as_posix(), "none")
+        if not (own.exists() or of_its_package.exists() or elsewhere.exists()):
             without.append(module.as_posix())
     assert without == []

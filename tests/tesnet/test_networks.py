@@ -1,8 +1,6 @@
 from __future__ import annotations
 
-import functools
 from collections.abc import Sequence
-from dataclasses import replace
 from pathlib import Path
 from typing import Any, ClassVar
 
@@ -10,155 +8,12 @@ import numpy as np
 import pytest
 import torch
 
-from tesnet import candidates, cloud, networks, weights
+from tesnet import cloud, networks, weights
 from tesnet.candidates import Candidates
 from tesnet.networks import Network
-from tesnet.networks.tesnet import CloudFeatures, TesNet, TesNetConfig, edge_features, point_inputs
+from tesnet.networks.tesnet import TesNet, TesNetConfig
 from tesnet.predictor import GraspPredictor, configuration_of
-from tests.tesnet.scenes import CAMERA, ask, fresh_network, prepared, tabletop, tabletop_query
-
-
-@functools.cache
-def example() -> tuple[cloud.PreparedCloud, Candidates]:
-    query = tabletop_query(max_candidates=150)
-    ready = prepared(query)
-    return ready, candidates.generate(ready, query, candidates.CandidateConfig())[0]
-
-
-@functools.cache
-def features() -> CloudFeatures:
-    with torch.inference_mode():
-        return fresh_network().encode_batch([example()[0]])[0]
-
-
-@torch.inference_mode()
-def score(found: Candidates, mirror: torch.Tensor | None = None) -> torch.Tensor:
-    return fresh_network().score(features(), example()[0], found, mirror)
-
-
-def test_there_is_a_feature_for_every_point_and_a_logit_for_every_candidate() -> None:
-    ready, found = example()
-    assert features().points.shape == (len(ready), 64)
-    assert features().context.shape == (32,)
-    logits = score(found)
-    assert logits.shape == (len(found),)
-    assert torch.isfinite(logits).all()
-    assert len(logits.unique()) > len(found) // 2
-
-
-def test_a_batch_of_candidates_is_scored_as_one_by_one() -> None:
-    _, found = example()
-    few = found.select(torch.arange(0, len(found), 10))
-    alone = torch.cat([score(few.select(torch.tensor([i]))) for i in range(len(few))])
-    torch.testing.assert_close(score(few), alone, atol=1e-5, rtol=0)
-
-
-def test_no_candidates_have_no_scores() -> None:
-    assert score(example()[1].select(torch.zeros(0, dtype=torch.long))).shape == (0,)
-
-
-def test_scores_follow_their_candidates_in_another_order() -> None:
-    _, found = example()
-    order = torch.randperm(len(found), generator=torch.Generator().manual_seed(0))
-    torch.testing.assert_close(score(found.select(order)), score(found)[order], atol=1e-5, rtol=0)
-
-
-def test_a_region_holds_the_points_that_a_loop_finds_there() -> None:
-    ready, found = example()
-    network = fresh_network()
-    for region, points in ((network.closing, ready.points), (network.around, features().patches.points)):
-        index, totals = region.members(points, found.Ts_canonical_grasp)
-        assert index.shape == (len(found), region.count)
-        breadth, length, behind, ahead = region.box
-        for row in range(0, len(found), 12):
-            T = found.Ts_canonical_grasp[row].double().numpy()
-            local = (points.double().numpy() - T[:3, 3]) @ T[:3, :3]
-            slack = np.min(
-                [breadth - abs(local[:, 0]), length - abs(local[:, 1]), local[:, 2] + behind, ahead - local[:, 2]],
-                axis=0,
-            )
-            certain, possible = (set(np.flatnonzero(slack > limit).tolist()) for limit in (1e-6, -1e-6))
-            count = min(region.count, int(totals[row]))
-            chosen = index[row, :count].tolist()
-            assert len(certain) <= int(totals[row]) <= len(possible)
-            assert len(chosen) == len(set(chosen)) == count
-            assert set(chosen) <= possible
-            assert set(index[row, count:].tolist()) <= {chosen[0]}
-
-
-def test_a_region_pools_what_its_layers_make_of_points_in_the_grasp_frame() -> None:
-    """The layers as written, in a loop: position, normal and facing in the grasp frame, mirrored where asked for."""
-    ready, found = example()
-    region, encoded = fresh_network().closing, features().points
-    sign = torch.where(torch.arange(len(found)) % 2 == 0, 1.0, -1.0)
-    with torch.inference_mode():
-        pooled, totals = region(encoded, ready, found.Ts_canonical_grasp, sign)
-        index, _ = region.members(ready.points, found.Ts_canonical_grasp)
-        for row in range(0, len(found), 15):
-            chosen = index[row, : min(region.count, int(totals[row]))]
-            T = found.Ts_canonical_grasp[row]
-            mirror = torch.tensor([float(sign[row]), 1.0, 1.0])
-            position = (ready.points[chosen] - T[:3, 3]) @ T[:3, :3] * mirror / 0.02
-            normal = ready.normals[chosen] @ T[:3, :3] * mirror
-            facing = (ready.normals * ready.view_directions).sum(dim=1, keepdim=True)[chosen]
-            hidden = region.geometry(torch.cat([position, normal, facing], 1)) + region.features(encoded[chosen])
-            expected = torch.relu(region.update(torch.relu(hidden))).amax(dim=0)
-            torch.testing.assert_close(pooled[row], expected, atol=1e-4, rtol=1e-4)
-
-
-def test_an_empty_region_pools_to_nothing() -> None:
-    ready, found = example()
-    away = found.Ts_canonical_grasp.clone()
-    away[:, :3, 3] += 10
-    with torch.inference_mode():
-        pooled, totals = fresh_network().closing(features().points, ready, away, torch.ones(len(found)))
-    assert not totals.any()
-    assert not pooled.any()
-
-
-def test_a_mirrored_scene_scores_as_the_mirror_option_says() -> None:
-    """Reflecting everything in the hand's plane, which holds y and z, changes the sign of x in the grasp frame."""
-    _, found = example()
-    one = torch.ones(len(found))
-    torch.testing.assert_close(score(found, one), score(found))
-    assert (score(found, -one) - score(found)).abs().max() > 1e-4
-
-
-def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
-    ready, found = example()
-    network = fresh_network()
-    tcp = found.Ts_canonical_grasp[0, :3, 3]
-
-    @torch.inference_mode()
-    def with_side(distance: float) -> torch.Tensor:
-        """Logits beside a plane across x, so far from the first candidate's TCP."""
-        bounded = replace(ready, sides=torch.tensor([[1.0, 0.0, 0.0, float(tcp[0]) + distance]]))
-        return network.score(features(), bounded, found)
-
-    torch.testing.assert_close(with_side(1.0), score(found), atol=1e-5, rtol=0)
-    assert (with_side(0.01) - score(found))[0].abs() > 1e-4
-
-
-def test_point_pair_features_are_distances_and_cosines() -> None:
-    ready, _ = example()
-    edges = edge_features(ready.points, ready.normals, ready.neighbours)
-    assert edges.shape == (len(ready), 16, 4)
-    for point in range(0, len(ready), 300):
-        other = int(ready.neighbours[point, 5])
-        p, q, n, m = (x.double().numpy() for x in (*ready.points[[point, other]], *ready.normals[[point, other]]))
-        distance = np.linalg.norm(q - p)
-        expected = [distance / 0.02, n @ (q - p) / distance, m @ (q - p) / distance, n @ m]
-        np.testing.assert_allclose(edges[point, 5], expected, atol=1e-5)
-    assert (edges[:, :, 1:].abs() <= 1 + 1e-5).all()
-
-
-@pytest.mark.parametrize(("options", "known"), [({}, 0), ({"up": [0, 0, 1]}, 1)])
-def test_what_the_caller_does_not_know_is_zero(options: dict[str, Any], known: int) -> None:
-    inputs = point_inputs(prepared(ask(tabletop(0), viewpoints=CAMERA, up=options.get("up"))))
-    assert inputs.shape[1] == 7
-    assert (inputs[:, 4] == known).all()  # whether up is known
-    assert (inputs[:, 5:] == 0).all()  # height and whether it is known
-    assert bool((inputs[:, 3] == 0).all()) == (known == 0)
+from tests.tesnet.scenes import prepared, tabletop_query
 
 
 def test_an_unknown_network_or_field_is_refused_with_the_valid_ones() -> None:

@@ -19,7 +19,6 @@ from tests.training.synthetic import labelled_view, write
 from training import evaluate as evaluating
 from training import fit as fitting
 from training import metrics
-from training.__main__ import main
 from training.evaluate import evaluate
 from training.fit import PRESETS, Recipe, fit
 from training.views import LabelsError
@@ -224,12 +223,6 @@ def test_the_learning_rate_is_halved_after_stagnant_epochs() -> None:
 def test_the_papers_recipe_is_a_preset() -> None:
     paper = PRESETS["paper"]
     assert (paper.optimiser, paper.patience, paper.cosine) == ("adam", 6, False)
-
-
-def test_the_command_says_what_is_wrong_with_its_input(tmp_path: Path, capsys: pytest.CaptureFixture[str]) -> None:
-    paths = {"--data": tmp_path / "none", "--validation": tmp_path, "--out": tmp_path / "a", "--threads": 1}
-    assert main(["fit", *(str(word) for pair in paths.items() for word in pair)]) == 2
-    assert "python -m training generate" in capsys.readouterr().err
 
 
 def test_the_calibration_is_fitted_where_it_is_told_to_be(folder: Path, tmp_path: Path) -> None:

@@ -1,0 +1,64 @@
+from __future__ import annotations
+
+from dataclasses import replace
+from pathlib import Path
+
+import numpy as np
+import pytest
+import torch
+
+from tesnet import networks, weights
+from tesnet.predictor import configuration_of
+from tests.tesnet.scenes import fresh_network
+from tests.training.synthetic import labelled_view, write
+from training import metrics
+from training.evaluate import evaluate, measure, score_views
+from training.views import LabelsError
+
+
+def test_views_are_scored_where_the_observed_cloud_leaves_them_free_unless_all_are_asked_for() -> None:
+    view = labelled_view(0)
+    free = torch.arange(len(view.outcomes)) % 3 == 0
+    views = [replace(view, collision_free=free), replace(view, collision_free=torch.zeros_like(free))]
+    network = fresh_network()
+    (logits, success), *others = score_views(network, views)
+    assert others == []  # nothing of the second view is free
+    np.testing.assert_array_equal(success, view.success[free])
+    alone = network.score(networks.encode(network, view.cloud), view.cloud, view.candidates.select(free))
+    np.testing.assert_allclose(logits, alone.detach().numpy(), atol=1e-5)
+    assert [len(logits) for logits, _ in score_views(network, views, blocked=True)] == [len(free)] * 2
+
+
+def test_the_calibration_is_fitted_to_every_other_view_and_judged_on_the_rest() -> None:
+    rng = np.random.default_rng(0)
+    scored = [(rng.normal(size=80), rng.random(80) < share) for share in (0.3, 0.6, 0.4, 0.5)]
+    found = measure(scored, seed=0)
+    fitted, judged = (
+        [np.concatenate([view[part] for view in scored[start::2]]) for part in (0, 1)] for start in (0, 1)
+    )
+    a, b = metrics.fit_calibration(*fitted)
+    assert found["calibration"] == pytest.approx([a, b])
+    assert found["served_loss"] == pytest.approx(metrics.cross_entropy(a * judged[0] + b, judged[1]))
+    assert found["candidates"] == 320
+    given = measure(scored, seed=0, calibration=(1.0, 0.0))
+    everything = [np.concatenate([view[part] for view in scored]) for part in (0, 1)]
+    assert given["served_loss"] == pytest.approx(metrics.cross_entropy(*everything))
+
+
+def test_measures_come_overall_by_scene_and_with_what_the_cloud_blocks(tmp_path: Path) -> None:
+    free = torch.arange(60) < 45
+    packed, pile = replace(labelled_view(0), collision_free=free), replace(labelled_view(1), scene="pile")
+    network = fresh_network()
+    weights.save(
+        tmp_path / "a.safetensors", network.state_dict(), weights.Header("tesnet", "1", configuration_of(network))
+    )
+    found = evaluate("tesnet", tmp_path / "a.safetensors", [write(tmp_path / "labels", [packed, pile])])
+    assert set(found) == {"weights_sha256", "all", "packed", "pile", "with_blocked"}
+    assert found["weights_sha256"] == weights.sha256(tmp_path / "a.safetensors")
+    assert [found[group]["candidates"] for group in ("all", "packed", "pile")] == [105, 45, 60]
+    assert [found["with_blocked"][group]["candidates"] for group in ("all", "packed", "pile")] == [120, 60, 60]
+
+
+def test_views_without_ten_successes_are_refused() -> None:
+    with pytest.raises(LabelsError, match="none of 1 views has 10 successes and a failure; label more"):
+        measure([(np.zeros(30), np.arange(30) < 9)], seed=0)
