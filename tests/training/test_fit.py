@@ -21,7 +21,7 @@ from training import fit as fitting
 from training import metrics
 from training.evaluate import evaluate
 from training.fit import PRESETS, Recipe, fit
-from training.views import LabelsError
+from training.views import LabelsError, load_views
 
 RECIPE = Recipe(max_epochs=2, views_per_step=2, candidates_per_view=30)
 
@@ -231,7 +231,7 @@ def test_the_calibration_is_fitted_where_it_is_told_to_be(folder: Path, tmp_path
     (apart, _), (same, _) = (networks.load(tmp_path / f"{name}.safetensors") for name in ("apart", "same"))
     torch.testing.assert_close(apart.state_dict(), same.state_dict())  # what is learned does not depend on it
     _, header = weights.load(tmp_path / "apart.safetensors")
-    views = list(fitting.load_views([folder / "train"], apart.preparation))
+    views = list(load_views([folder / "train"], apart.preparation))
     scored = evaluating.score_views(apart, views)
     joined = [np.concatenate(parts) for parts in zip(*scored, strict=True)]
     assert header.calibration == pytest.approx(metrics.fit_calibration(*joined))
