@@ -36,15 +36,15 @@ class ModelInfo:
     """Which network answers.
 
     Args:
-        name, version: of the weights.
-        weights_sha256: of the file.
+        name, version: of the weights; those of a network without weights never change.
+        weights_sha256: of the file; None without one.
         card: data, seed and metrics of the training, as the weights' header tells them.
         configuration: network, preparation and candidates.
     """
 
     name: str
     version: str
-    weights_sha256: str
+    weights_sha256: str | None
     card: Mapping[str, Any]
     configuration: Mapping[str, Any]
 
@@ -99,6 +99,28 @@ class GraspPredictor:
         except (KeyError, TypeError, ValueError) as error:
             why = f"its configuration is not of this version ({error}); get matching weights"
             raise WeightsError(path, why) from error
+
+    @classmethod
+    def without_weights(cls, name: str, device: str = "cpu", num_threads: int | None = None) -> GraspPredictor:
+        """A predictor whose network learns nothing, such as `heuristic`.
+
+        Raises:
+            ValueError: a network that is unknown or has weights.
+            DeviceError: this machine does not have the device.
+        """
+        if not networks.is_weightless(name):
+            raise ValueError(f"network {name!r} has weights; load them from a file")
+        chosen = _device(device)
+        if num_threads is not None:
+            torch.set_num_threads(num_threads)
+        network = networks.build(name).eval()
+        sections = configuration_of(network)
+        return cls(network.to(chosen), sections, (1.0, 0.0), ModelInfo(name, "1", None, {}, sections), chosen)
+
+    @property
+    def preparation(self) -> cloud.PreparationConfig:
+        """How clouds are prepared."""
+        return self._preparation
 
     def warm_up(self) -> None:
         """Answers one made-up query, so that the first real one is not slow."""

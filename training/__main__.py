@@ -1,4 +1,4 @@
-"""`python -m training generate|pack|unpack|fit|evaluate`: labels, weights and their measures."""
+"""`python -m training generate|pack|unpack|fit|evaluate|compare`: labels, weights and their measures."""
 
 from __future__ import annotations
 
@@ -15,6 +15,7 @@ from tesnet import networks
 from tesnet.cloud import PreparationConfig
 from tesnet.errors import TesnetError
 from training.archive import is_archive, pack, unpack
+from training.compare import compare
 from training.evaluate import evaluate
 from training.fit import PRESETS, fit
 from training.generate import GenerateConfig, generate
@@ -41,6 +42,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_unpack(commands.add_parser("unpack", help="render the clouds of an archive again"))
     _add_fit(commands.add_parser("fit", help="train a network on stored labels"))
     _add_evaluate(commands.add_parser("evaluate", help="measure a network on stored labels"))
+    _add_compare(commands.add_parser("compare", help="put trained networks side by side: table and figure"))
     return parser
 
 
@@ -211,6 +213,15 @@ def _add_evaluate(parser: argparse.ArgumentParser) -> None:
 
 def _evaluate(options: argparse.Namespace) -> dict[str, object]:
     return evaluate(options.model, options.weights, options.data, options.seed)
+
+
+def _add_compare(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--data", type=Path, required=True, help="folder of weights that `fit` wrote, with their logs")
+    parser.add_argument("--out", type=Path, required=True, help="folder for table1 and figure6")
+    parser.add_argument(
+        "--validation", type=Path, nargs="+", default=[], help="their labels; adds heuristic and shipped weights"
+    )
+    parser.set_defaults(run=lambda options: compare(options.data, options.out, options.validation))
 
 
 if __name__ == "__main__":

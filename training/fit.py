@@ -151,7 +151,7 @@ def fit(
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
     network = networks.build(name)
-    if not list(network.parameters()):
+    if networks.is_weightless(name):
         raise LabelsError(f"{name} has no parameters to train; choose another network")
     train_views = [view for view in load_views(data, network.preparation) if metrics.usable(view.success.numpy())]
     if not train_views:

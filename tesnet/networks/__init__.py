@@ -20,7 +20,7 @@ from tesnet.networks.pointnetgpd import PointNetGPD, PointNetGPDConfig
 from tesnet.networks.tesnet import TesNet, TesNetConfig
 from tesnet.networks.tesnet_paper import TesNetEuclideanConfig, TesNetPaper, TesNetPaperConfig
 
-__all__ = ["NETWORKS", "Network", "build", "encode", "load"]
+__all__ = ["NETWORKS", "Network", "build", "encode", "is_weightless", "load"]
 
 NETWORKS: Mapping[str, tuple[type[Network], type[Any]]] = {
     "tesnet": (TesNet, TesNetConfig),
@@ -56,6 +56,15 @@ def build(name: str, config: Mapping[str, Any] | None = None) -> Network:
     if unknown:
         raise ValueError(f"unknown configuration {', '.join(unknown)} of {name}; valid: {', '.join(fields)}")
     return network_class(config_class(**given))
+
+
+def is_weightless(name: str) -> bool:
+    """Whether a network, one of `NETWORKS`, has no parameters: nothing to train and no file to load.
+
+    Raises:
+        ValueError: an unknown name; the message lists the valid ones.
+    """
+    return not list(build(name).parameters())
 
 
 def load(path: Path) -> tuple[Network, weights.Header]:
