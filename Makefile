@@ -6,17 +6,20 @@
 #   make serve    start the service on port 8000     make bench    speed tables
 #   make test     run the tests                      make check    lint, types, walls between packages
 #   make format   rewrite files in the one style     make audit    pinned versions against published advisories
+#   make mutants  put small faults into the code and list those that no test notices; under an hour on two cores
 #
 # Variables:
 #   PYTHON=python3.11       interpreter for the environment (3.10 or 3.11: PyBullet has no wheels for later ones)
 #   TORCH_INDEX_URL=URL     index for PyTorch alone, for example its CPU wheels: https://download.pytorch.org/whl/cpu
 #   PYTEST_ARGS="..."       more arguments for pytest, for example -k pose
+#   MUTANTS_ARGS="..."      arguments of `python -m bench.mutants`, for example --packages training --seed 1
 
 PYTHON ?= python3.11
 VENV ?= .venv
 TORCH_INDEX_URL ?=
 TEST_WORKERS ?= 2
 PYTEST_ARGS ?=
+MUTANTS_ARGS ?=
 DEMO_ROUNDS ?= 3
 DEMO_SCENE ?= packed
 
@@ -25,7 +28,7 @@ TO_RUN := $(VENV)/.to-run
 TO_DEVELOP := $(VENV)/.to-develop
 PIP_INSTALL := $(BIN)/python -m pip install --constraint constraints.txt
 
-.PHONY: demo test check format serve bench audit clean
+.PHONY: demo test check format serve bench audit mutants clean
 .DELETE_ON_ERROR:
 
 demo: $(TO_RUN)
@@ -57,6 +60,9 @@ bench: $(TO_DEVELOP)
 
 audit: $(TO_DEVELOP)
 	.ci/audit $(BIN)/python
+
+mutants: $(TO_DEVELOP)
+	$(BIN)/python -m bench.mutants --workers $(TEST_WORKERS) $(MUTANTS_ARGS)
 
 # PyTorch comes first and alone: an index of CPU wheels must not answer for anything else, its dependencies included.
 $(TO_RUN): pyproject.toml constraints.txt

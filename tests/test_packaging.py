@@ -34,7 +34,7 @@ EXTRAS = {
     "service": ("service", "ray"),  # of which only service.deploy.ray needs Ray
     "simharness": ("sim", "fusion", "sensors", "watch", "ray"),  # of which only options need all but the first
     "training": ("service", "sim"),
-    "bench": ("service", "dev"),  # fuzzing needs what generates requests
+    "bench": ("service", "dev", "mutants"),  # fuzzing needs what generates requests
 }
 
 
