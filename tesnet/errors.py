@@ -8,6 +8,7 @@
     +-- TooManyPoints    a cloud file with more points than the caller's limit
     +-- WeightsError     a weights file that is missing, corrupted or of another network; `path` names it
     +-- DeviceError      a compute device that this machine does not have
+    +-- GaveUp           a prediction that nobody waits for any more
 
 Messages give the value, the limit and the remedy. They never contain the cloud.
 """
@@ -15,6 +16,9 @@ Messages give the value, the limit and the remedy. They never contain the cloud.
 from __future__ import annotations
 
 from pathlib import Path
+
+_MOST_SHOWN = 10**15
+"""A header can claim a number of thousands of digits, which no message should repeat."""
 
 
 class TesnetError(Exception):
@@ -48,7 +52,8 @@ class TooManyPoints(TesnetError):
     """
 
     def __init__(self, count: int | str, limit: int) -> None:
-        super().__init__(f"The cloud has {count} points (limit {limit}); crop or downsample it.")
+        shown = f"over {_MOST_SHOWN}" if isinstance(count, int) and count > _MOST_SHOWN else count
+        super().__init__(f"The cloud has {shown} points (limit {limit}); crop or downsample it.")
         self.count = count
         self.limit = limit
 
@@ -69,3 +74,10 @@ class WeightsError(TesnetError):
 
 class DeviceError(TesnetError):
     """The compute device asked for does not exist on this machine."""
+
+
+class GaveUp(TesnetError):
+    """A prediction was left unfinished, as its caller's `give_up` asked."""
+
+    def __init__(self) -> None:
+        super().__init__("The prediction was given up: nobody waits for it any more; ask again with more time.")

@@ -3,16 +3,16 @@
 from __future__ import annotations
 
 import time
-from collections.abc import Mapping, Sequence
+from collections.abc import Callable, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeAlias
 
 import numpy as np
 import torch
 
 from tesnet import candidates, cloud, collision, networks, ranking, support, weights
-from tesnet.errors import DeviceError, WeightsError
+from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box, GraspSet
 from tesnet.networks import Network
 from tesnet.query import MAX_SEED, GraspQuery
@@ -29,6 +29,10 @@ FURTHER_SEARCHES = 4
 
 _SEED_STEP = 0x9E3779B97F4A7C15
 """Between the seeds of one query's searches: queries whose seeds follow each other share none."""
+
+
+GiveUp: TypeAlias = Callable[[], bool]
+"""Whether nobody waits for a query's answer any more. It may take its time, as a caller does that has other work."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -130,30 +134,49 @@ class GraspPredictor:
         points = np.where(rng.random((4000, 1)) < 0.5, np.hstack([square, side]), np.hstack([side, square]))
         self.predict(GraspQuery(points, viewpoints=np.array([0.3, 0.2, 0.6])))
 
-    def predict(self, query: GraspQuery) -> GraspResult:
-        """Ranked grasps for a query, in the frame of its points. Equal queries have equal answers."""
-        return self.predict_batch([query])[0]
+    def predict(self, query: GraspQuery, give_up: GiveUp | None = None) -> GraspResult:
+        """Ranked grasps for a query, in the frame of its points. Equal queries have equal answers.
+
+        Args:
+            query: what is asked.
+            give_up: asked between stages, in this thread; true ends the prediction.
+
+        Raises:
+            GaveUp: as `give_up` asked.
+        """
+        return self.predict_batch([query], [give_up])[0]
 
     @torch.inference_mode()
-    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[GraspResult]:
+    def predict_batch(
+        self, queries: Sequence[GraspQuery], give_up: Sequence[GiveUp | None] | None = None
+    ) -> list[GraspResult]:
         """The answer to each query, as `predict` gives it; their clouds are encoded in one pass.
 
         Scores may differ from those of `predict` by the rounding of float32. The time of the shared pass is divided
         among the answers in proportion to their prepared points.
+
+        Args:
+            queries: what is asked.
+            give_up: of each query, as in `predict`; the first that is true ends the whole batch.
+
+        Raises:
+            GaveUp: as one of `give_up` asked.
         """
-        begun = [self._propose(query) for query in queries]
+        patience = [None] * len(queries) if give_up is None else give_up
+        begun = [self._propose(*asked) for asked in zip(queries, patience, strict=True)]
         features = iter(self._encode([item for item in begun if isinstance(item, _Proposal)]))
         return [self._answer(item, next(features)) if isinstance(item, _Proposal) else item for item in begun]
 
-    def _propose(self, query: GraspQuery) -> _Proposal | GraspResult:
+    def _propose(self, query: GraspQuery, give_up: GiveUp | None) -> _Proposal | GraspResult:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""
-        clock = _Clock()
+        clock = _Clock(give_up)
         rejected = dict.fromkeys(REJECTIONS, 0)
         notes = _query_warnings(query)
         if query.support_height == "auto":
             query, note = support.settled(query, self.device)
             notes.append(note)
 
+        clock.check()
         prepared = cloud.prepare(query, self._preparation, self.device)
         self._synchronise()
         clock.lap("prepare")
@@ -166,7 +189,7 @@ class GraspPredictor:
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
         notes += _target_warnings(prepared, query, self._preparation)
 
-        found = self._search(prepared, query)
+        found = self._search(prepared, query, clock)
         self._synchronise()
         clock.lap("candidates")
         if len(found.free) == 0:
@@ -175,8 +198,10 @@ class GraspPredictor:
             return _nothing(query, reason, sizes, rejected | found.rejected, notes, clock)
         return _Proposal(query, prepared, found, notes, clock)
 
-    def _search(self, prepared: cloud.PreparedCloud, query: GraspQuery) -> _Found:
+    def _search(self, prepared: cloud.PreparedCloud, query: GraspQuery, clock: _Clock) -> _Found:
+        clock.check()
         found, rejected = candidates.generate(prepared, query, self._candidates)
+        clock.check()
         blocked = collision.blocked(prepared, found.Ts_canonical_grasp, query.gripper, query.unseen)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
 
@@ -184,6 +209,8 @@ class GraspPredictor:
         """The features of each proposal's cloud, whose clock is told its share of the pass."""
         if not proposals:
             return []
+        for proposal in proposals:
+            proposal.clock.check()
         started = time.perf_counter()
         features = self._network.encode_batch([proposal.prepared for proposal in proposals])
         self._synchronise()
@@ -196,6 +223,7 @@ class GraspPredictor:
         """The ranked grasps of the best search for a proposal."""
         query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
         clock.start()
+        clock.check()
         found, scores = self._best_search(proposal, features)
         ranked = ranking.rank(
             scores,
@@ -229,10 +257,11 @@ class GraspPredictor:
             # Where a search yields few candidates it has tried every approach point.
             if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates:
                 break
-            other = self._search(prepared, _further(query, number))
+            other = self._search(prepared, _further(query, number), clock)
             self._synchronise()
             clock.lap("candidates")
             if len(other.free):
+                clock.check()
                 other_scores = self._scores(features, prepared, other)
                 if float(other_scores.max()) > float(scores.max()):
                     found, scores = other, other_scores
@@ -251,14 +280,28 @@ class GraspPredictor:
 
 
 class _Clock:
-    """Milliseconds by stage; a lap ends where the next one begins."""
+    """Milliseconds by stage; a lap ends where the next one begins.
 
-    def __init__(self) -> None:
+    Args:
+        give_up: whether nobody waits any more for what is timed.
+    """
+
+    def __init__(self, give_up: GiveUp | None) -> None:
+        self._give_up = give_up
         self.laps_ms = dict.fromkeys(("prepare", "candidates", "network", "rank"), 0.0)
         self.start()
 
     def start(self) -> None:
         self._last = time.perf_counter()
+
+    def check(self) -> None:
+        """Raise `GaveUp` where nobody waits any more. The time that asking takes is no stage's."""
+        if self._give_up is None:
+            return
+        asked = time.perf_counter()
+        if self._give_up():
+            raise GaveUp
+        self._last += time.perf_counter() - asked
 
     def lap(self, name: str) -> None:
         now = time.perf_counter()

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import itertools
 import subprocess
 import sys
 from dataclasses import replace
@@ -14,7 +15,7 @@ from scipy.spatial import cKDTree
 
 from tesnet import cloud, weights
 from tesnet import predictor as predictor_module
-from tesnet.errors import DeviceError, WeightsError
+from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box
 from tesnet.predictor import GraspPredictor, configuration_of
 from tesnet.query import ApproachCone, GraspQuery
@@ -61,6 +62,12 @@ def predictor() -> GraspPredictor:
 @functools.cache
 def answer(**options: Any) -> GraspResult:
     return predictor().predict(tabletop_query(**options))
+
+
+def assert_equal(one: GraspResult, other: GraspResult) -> None:
+    np.testing.assert_array_equal(one.grasps.Ts_cloud_grasp, other.grasps.Ts_cloud_grasp)
+    np.testing.assert_array_equal(one.grasps.scores, other.grasps.scores)
+    assert one.counts == other.counts
 
 
 def assert_sound(result: GraspResult, query: GraspQuery) -> None:
@@ -220,9 +227,7 @@ def test_a_batch_has_the_answers_of_its_queries_one_by_one() -> None:
 
 def test_equal_queries_have_equal_answers() -> None:
     first, second = (predictor().predict(tabletop_query()) for _ in range(2))
-    np.testing.assert_array_equal(first.grasps.Ts_cloud_grasp, second.grasps.Ts_cloud_grasp)
-    np.testing.assert_array_equal(first.grasps.scores, second.grasps.scores)
-    assert first.counts == second.counts
+    assert_equal(first, second)
 
 
 def test_another_seed_tries_other_candidates() -> None:
@@ -235,6 +240,44 @@ def test_an_answer_leaves_no_trace_in_the_predictor() -> None:
     fresh.warm_up()
     fresh.predict(tabletop_query(2))
     np.testing.assert_array_equal(fresh.predict(tabletop_query()).grasps.scores, answer().grasps.scores)
+
+
+def test_a_prediction_that_nobody_waits_for_ends_wherever_it_is() -> None:
+    asked = 0
+
+    def count() -> bool:
+        nonlocal asked
+        asked += 1
+        return False
+
+    query = tabletop_query()
+    whole = predictor().predict(query, count)
+    assert asked >= 5
+    for last in range(1, asked + 1):
+        calls = itertools.count(1)
+        with pytest.raises(GaveUp):
+            predictor().predict(query, lambda calls=calls, last=last: next(calls) == last)
+    assert_equal(predictor().predict(query), whole)
+
+
+def test_one_query_of_a_batch_that_nobody_waits_for_ends_the_batch() -> None:
+    queries = [tabletop_query(), tabletop_query(seed=1)]
+    with pytest.raises(GaveUp):
+        predictor().predict_batch(queries, [None, lambda: True])
+
+
+def test_another_query_may_be_answered_while_one_is_asked_whether_to_go_on() -> None:
+    other = tabletop_query(seed=3)
+    between: list[GraspResult] = []
+
+    def answer_another() -> bool:
+        between.append(predictor().predict(other))
+        return False
+
+    assert_equal(predictor().predict(tabletop_query(), answer_another), predictor().predict(tabletop_query()))
+    for result in between:
+        assert_equal(result, between[0])
+    assert_equal(between[0], predictor().predict(other))
 
 
 def test_the_global_random_state_is_neither_read_nor_changed() -> None:
@@ -259,8 +302,8 @@ def test_other_candidates_are_searched_for_while_the_best_score_is_low(monkeypat
     searches = []
     search = predictor._search
 
-    def note(prepared: cloud.PreparedCloud, asked: GraspQuery) -> Any:
-        found = search(prepared, asked)
+    def note(prepared: cloud.PreparedCloud, asked: GraspQuery, clock: Any) -> Any:
+        found = search(prepared, asked, clock)
         searches.append((asked.num_approach_points, asked.seed, found.count))
         return found
 
