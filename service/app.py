@@ -20,6 +20,7 @@ from service.batching import PredictionWorker, PredictorFactory
 from service.errors import NotReady, ServiceError, Unauthorized, problem_response
 from service.grasps import GraspEndpoint
 from service.inference_protocol import inference_protocol
+from service.memory import Memory
 from service.metrics import Metrics
 from service.middleware import RequestMiddleware
 from service.openapi import document_grasps, document_keys, problems
@@ -44,7 +45,8 @@ def create_app(
     on_ready: Callable[[], None] = lambda: None,
     on_failure: Callable[[BaseException], None] = lambda _: None,
 ) -> FastAPI:
-    """The application, loading its predictor when its lifespan starts. `app.state.endpoint` is its `GraspEndpoint`.
+    """The application, loading its predictor when its lifespan starts. `app.state` has its `endpoint` and its
+    `memory`.
 
     Args:
         settings: limits and defaults.
@@ -53,11 +55,23 @@ def create_app(
         on_failure: called there with the exception when the predictor cannot be made.
     """
     metrics = Metrics()
+    memory = Memory(settings.max_held_bytes)
     worker = PredictionWorker(
-        predictor_factory, settings.queue_size, settings.max_batch, metrics.batch, on_ready, on_failure
+        predictor_factory,
+        settings.queue_size,
+        settings.max_batch,
+        metrics.batch,
+        on_ready,
+        on_failure,
+        settings.places_of_a_client,
     )
     endpoint = GraspEndpoint(settings, worker, metrics)
-    metrics.watch(queue_depth=lambda: worker.depth, active=lambda: endpoint.active, is_ready=lambda: endpoint.ready)
+    metrics.watch(
+        queue_depth=lambda: worker.depth,
+        active=lambda: endpoint.active,
+        is_ready=lambda: endpoint.ready,
+        held_bytes=lambda: memory.held,
+    )
 
     @asynccontextmanager
     async def lifespan(_: FastAPI) -> AsyncIterator[None]:
@@ -75,6 +89,7 @@ def create_app(
         redirect_slashes=False,
     )
     app.state.endpoint = endpoint
+    app.state.memory = memory
     if settings.api_keys:
         app.add_middleware(AccessMiddleware, keys=[key.get_secret_value() for key in settings.api_keys])
     if settings.cors_origins:  # outside: a browser asks for permission without a key
@@ -93,7 +108,7 @@ def create_app(
             ],
             expose_headers=["Inference-Header-Content-Length", "Retry-After", "X-Request-ID"],
         )
-    app.add_middleware(RequestMiddleware, metrics=metrics)
+    app.add_middleware(RequestMiddleware, metrics=metrics, memory=memory)
     for kind in (ServiceError, InvalidQuery, TooManyPoints, UnreadableFile, HTTPException):
         app.add_exception_handler(kind, _answer_problem)
 

@@ -1,8 +1,9 @@
 """One worker thread that owns the predictor, behind a bounded queue. Knows neither HTTP nor the event loop.
 
 The predictor is made, warmed up and used in the worker's thread only. It predicts together what waits when it is free,
-up to a limit; it never waits for more to come. A request is a `concurrent.futures.Future`: whoever waits for it may
-cancel it while it is queued, and its place is free again at once. A job whose deadline has passed is never predicted.
+up to a limit; it never waits for more to come. `service.turns` says whose turn it is. Between the stages of a
+prediction much cheaper ones have their turn, and one that nobody waits for is given up there: its deadline has passed,
+whoever waited for it has cancelled it, or the worker ends.
 """
 
 from __future__ import annotations
@@ -11,25 +12,24 @@ import logging
 import math
 import threading
 import time
-from collections import deque
-from collections.abc import Callable, Sequence
-from concurrent.futures import Future
-from dataclasses import dataclass, field
+from collections.abc import Callable, Hashable, Sequence
+from dataclasses import dataclass
+from functools import partial
 from typing import TYPE_CHECKING, Literal, Protocol
 
+from service.cost import Costs
 from service.errors import DeadlineExceeded, NotReady, QueueFull
+from service.turns import Answer, Job, Turns, may_interrupt
+from tesnet.errors import GaveUp
 from tesnet.query import GraspQuery
 from tesnet.result import GraspResult
 
 if TYPE_CHECKING:  # importing it loads torch, which `--help` and a port in use need not wait for
-    from tesnet.predictor import ModelInfo
+    from tesnet.predictor import GiveUp, ModelInfo
 
 log = logging.getLogger(__name__)
 
 State = Literal["loading", "ready", "failed", "stopped"]
-
-FIRST_GUESS_S = 0.1
-"""Seconds that a prediction should take before any was measured."""
 
 
 class Predictor(Protocol):
@@ -46,35 +46,28 @@ class Predictor(Protocol):
     def warm_up(self) -> None:
         """Predict once, so that the first request is not slow."""
 
-    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[GraspResult]:
-        """The answer to each query."""
+    def predict_batch(
+        self, queries: Sequence[GraspQuery], give_up: Sequence[GiveUp | None] | None = None
+    ) -> list[GraspResult]:
+        """The answer to each query; `tesnet.errors.GaveUp` where one of `give_up` says that nobody waits."""
 
 
 PredictorFactory = Callable[[], Predictor]
 
 
-@dataclass(frozen=True, slots=True)
-class Answer:
-    """A prediction, how long its query waited for the predictor, and how many were predicted together."""
+@dataclass(slots=True)
+class _Running:
+    """What is being predicted.
 
-    result: GraspResult
-    queue_ms: float
-    batch_size: int
+    Args:
+        batch: the jobs.
+        until: when it should be done.
+        stolen: seconds that other predictions took in the middle of it.
+    """
 
-
-@dataclass(frozen=True, eq=False, slots=True)
-class Job:
-    """A query in the queue, with its deadline on the clock of `time.perf_counter`, which no change of date moves."""
-
-    query: GraspQuery
-    deadline: float = math.inf
-    future: Future[Answer] = field(default_factory=Future)
-    submitted: float = field(default_factory=time.perf_counter)
-
-    def refuse(self, error: Exception) -> None:
-        """Give the waiting request an error in place of an answer, unless it has gone already."""
-        if self.future.set_running_or_notify_cancel():
-            self.future.set_exception(error)
+    batch: Sequence[Job]
+    until: float
+    stolen: float = 0.0
 
 
 class PredictionWorker:
@@ -87,6 +80,7 @@ class PredictionWorker:
         on_batch: told the size of every batch that is predicted.
         on_ready: told when queries are taken.
         on_failure: told the exception when the predictor cannot be made; the worker's state is `failed` then.
+        client_capacity: how many queries of one client may wait, where clients are known; None is no limit.
     """
 
     def __init__(
@@ -97,20 +91,20 @@ class PredictionWorker:
         on_batch: Callable[[int], None] = lambda _: None,
         on_ready: Callable[[], None] = lambda: None,
         on_failure: Callable[[BaseException], None] = lambda _: None,
+        client_capacity: int | None = None,
     ) -> None:
         self._factory = factory
-        self._capacity = capacity
         self._max_batch = max_batch
         self._on_batch = on_batch
         self._on_ready = on_ready
         self._on_failure = on_failure
-        self._jobs: deque[Job] = deque()
+        self._turns = Turns(capacity, client_capacity)
+        self._costs = Costs()
         self._changed = threading.Condition()
         self._state: State = "loading"
         self._model: ModelInfo | None = None
         self._device = ""
-        self._seconds: dict[int, float] = {}  # of the latest predictions, by `_size`
-        self._free_at = 0.0  # when what is being predicted should be done, on the clock of deadlines
+        self._running: list[_Running] = []  # the last one interrupts the one before it
         self._thread = threading.Thread(target=self._run, name="predictor", daemon=True)
 
     @property
@@ -137,19 +131,14 @@ class PredictionWorker:
     @property
     def depth(self) -> int:
         """Queries that wait."""
-        return len(self._jobs)
+        with self._changed:
+            return len(self._turns)
 
     @property
     def expected_wait(self) -> float:
-        """Seconds that a query queued now would wait, judged by how long the latest clouds of like size took."""
+        """Seconds in which everything that was asked should be answered."""
         with self._changed:
-            waiting = sum(self._expected(job.query) for job in self._jobs)
-            return max(0.0, self._free_at - time.perf_counter()) + waiting
-
-    @property
-    def retry_after(self) -> int:
-        """Whole seconds, 1 to 60, in which a full queue should have been worked off."""
-        return _whole_seconds(self.expected_wait)
+            return self._busy() + self._turns.expected
 
     def start(self) -> None:
         """Start loading."""
@@ -166,8 +155,7 @@ class PredictionWorker:
         """
         with self._changed:
             self._state = "stopped"
-            waiting = list(self._jobs)
-            self._jobs.clear()
+            waiting = self._turns.clear()
             self._changed.notify()
         for job in waiting:
             job.refuse(NotReady("The service ended before this request's turn; repeat it.", retry_after=1))
@@ -192,56 +180,93 @@ class PredictionWorker:
         if self._state != "ready":
             raise NotReady(f"The predictor is {self._state}; come back in a moment.", retry_after=1)
 
-    def check_room(self) -> None:
-        """Whether one more query may wait: asked early, before a body is read, and again by `submit`.
+    def check_room(self, client: Hashable = None, *, may_be_cheap: bool = True) -> None:
+        """Whether one more query may wait: asked early, before a body is read; `submit` asks again.
+
+        Args:
+            client: whose it is, where that is known.
+            may_be_cheap: whether it may turn out to be so cheap that it has a spare place.
 
         Raises:
             QueueFull: as many wait as may.
         """
-        if len(self._jobs) >= self._capacity:
-            raise QueueFull(
-                f"{len(self._jobs)} requests wait (limit {self._capacity}); repeat this one in {self.retry_after} s.",
-                self.retry_after,
-            )
+        with self._changed:
+            self._check_client(client)
+            if len(self._turns) >= (self._turns.most if may_be_cheap else self._turns.places):
+                raise self._full()
 
-    def submit(self, query: GraspQuery, deadline: float = math.inf, begin_by: float = math.inf) -> Job:
+    def submit(
+        self,
+        query: GraspQuery,
+        deadline: float = math.inf,
+        begin_by: float = math.inf,
+        client: Hashable = None,
+    ) -> Job:
         """Queue a query; its future gives an `Answer`.
 
         Args:
             query: what is asked.
             deadline: by when the answer is wanted, on the clock of `time.perf_counter`.
             begin_by: by when the prediction has to begin, on the same clock. After either the query is not predicted.
+            client: whose it is, where that is known.
 
         Raises:
             QueueFull: as many wait as may, or so many that the query would be late; it says when the same query would
-                not be. A free predictor tries every query: how long one takes is a guess, and only trying mends it.
+                not be. A free predictor takes every query: how long one takes is a guess, and only trying mends it.
             NotReady: loading, failed or stopped.
         """
         with self._changed:
             self.check_ready()
-            self.check_room()
-            now, wait, own = time.perf_counter(), self.expected_wait, self._expected(query)
-            left = min(begin_by, deadline - own) - now
-            if wait > 0 and wait > left and now < min(begin_by, deadline):  # what is late already gets its 504
-                if wait <= min(begin_by, deadline) - now:  # a guess at its own time, which must not refuse it for ever
-                    self._seconds[_size(query)] = 0.9 * own
-                retry_after = _whole_seconds(wait - left)
-                raise QueueFull(
-                    f"{len(self._jobs)} requests wait and the predictor is busy for some {wait:.1f} s; to be in time, "
-                    f"this one of some {own:.1f} s would have to begin within {max(0.0, left):.1f} s; repeat it in "
-                    f"{retry_after} s or with a larger X-Request-Timeout.",
-                    retry_after,
-                )
-            job = Job(query, min(deadline, begin_by))
-            self._jobs.append(job)
+            self._check_client(client)
+            now = time.perf_counter()
+            job = Job(query, self._costs.expected(query, now), deadline, begin_by, client, submitted=now)
+            if not self._turns.has_place(job):
+                raise self._full()
+            self._check_in_time(job, now)
+            self._turns.add(job, self._busy())
             self._changed.notify()
         return job
 
     def cancel(self, job: Job) -> None:
-        """Nobody waits for the job any more: free its place. One that is being predicted runs to its end unheard."""
+        """Nobody waits for the job any more: free its place. One that is being predicted is given up."""
+        job.forsaken = True
         with self._changed:
-            if job.future.cancel() and job in self._jobs:
-                self._jobs.remove(job)
+            if job.future.cancel():
+                self._turns.remove(job)
+
+    def _check_client(self, client: Hashable) -> None:
+        if self._turns.is_full_for(client):
+            raise QueueFull(
+                f"{self._turns.client_places} requests of yours wait, which is the limit for one client; wait for an "
+                "answer before you ask again.",
+                _whole_seconds(self.expected_wait),
+            )
+
+    def _check_in_time(self, job: Job, now: float) -> None:
+        """Raise `QueueFull` for a job that would be late. Its own time counts where it was measured, not guessed."""
+        wait = self._turns.ahead_of(job)
+        if self._running and not may_interrupt(job, self._running[0].batch[0]):
+            wait += self._busy()
+        own = self._costs.measured(job.query, now) or 0.0
+        left = min(job.begin_by, job.deadline - own) - now
+        if wait > 0 and left < wait and now < job.latest:  # what is late already gets its 504
+            retry_after = _whole_seconds(wait - left)
+            raise QueueFull(
+                f"{len(self._turns)} requests wait and the predictor is busy for some {wait:.1f} s; to be in time, "
+                f"this one of some {job.expected:.1f} s would have to begin within {max(0.0, left):.1f} s; repeat it "
+                f"in {retry_after} s or with a larger X-Request-Timeout.",
+                retry_after,
+            )
+
+    def _full(self) -> QueueFull:
+        retry_after = _whole_seconds(self.expected_wait)
+        waiting = f"{len(self._turns)} requests wait (limit {self._turns.places})"
+        return QueueFull(f"{waiting}; repeat this one in {retry_after} s.", retry_after)
+
+    def _busy(self) -> float:
+        """Seconds until what is being predicted should be done."""
+        now = time.perf_counter()
+        return max([0.0, *(running.until - now for running in self._running)])
 
     def _run(self) -> None:
         try:
@@ -258,62 +283,92 @@ class PredictionWorker:
                 self._state = "ready"
                 self._on_ready()
         while batch := self._next_batch():
-            self._on_batch(len(batch))
             self._predict(predictor, batch)
 
     def _next_batch(self) -> list[Job]:
         """The jobs to predict together, at least one; none when the worker is to end."""
         batch: list[Job] = []
         with self._changed:
-            self._free_at = 0.0
             while not batch:
-                self._changed.wait_for(lambda: self._jobs or self._state == "stopped")
+                self._changed.wait_for(lambda: len(self._turns) or self._state == "stopped")
                 if self._state == "stopped":
                     return []
-                while self._jobs and len(batch) < self._max_batch:
-                    job = self._jobs.popleft()
-                    if time.perf_counter() > job.deadline:
-                        job.refuse(DeadlineExceeded("The deadline passed while the request waited for its turn."))
-                    elif job.future.set_running_or_notify_cancel():
+                while len(batch) < self._max_batch and (job := self._turns.take()):
+                    if _begins(job):
                         batch.append(job)
-            self._free_at = time.perf_counter() + sum(self._expected(job.query) for job in batch)
+            self._begin(batch)
         return batch
 
+    def _begin(self, batch: list[Job]) -> None:
+        """Note, in the same hold of the lock in which the jobs ceased to wait, that they are being predicted."""
+        seconds = sum(job.expected for job in batch)
+        for running in self._running:
+            running.until += seconds
+        self._running.append(_Running(batch, time.perf_counter() + seconds))
+
     def _predict(self, predictor: Predictor, batch: list[Job]) -> None:
+        """Predict what `_begin` was told of. The predictor counts as free before anybody hears of an answer."""
         started = time.perf_counter()
+        self._on_batch(len(batch))
+        give_up = [partial(self._give_up, predictor, job) for job in batch]
         try:
-            results = predictor.predict_batch([job.query for job in batch])
+            results = predictor.predict_batch([job.query for job in batch], give_up)
         except Exception as error:  # noqa: BLE001 - the waiting request raises it again
-            if len(batch) > 1:  # each by itself, so that a query's fault is its own
-                for job in batch:
-                    self._predict(predictor, [job])
-            else:
-                batch[0].future.set_exception(error)
+            self._end(None)
+            self._fail(predictor, batch, error)
             return
-        self._learn(batch, time.perf_counter() - started)
+        self._end(started)
         for job, result in zip(batch, results, strict=True):
             job.future.set_result(Answer(result, 1e3 * (started - job.submitted), len(batch)))
 
-    def _expected(self, query: GraspQuery) -> float:
-        """Seconds that a prediction should take: as the latest ones of the nearest size."""
-        if not self._seconds:
-            return FIRST_GUESS_S
-        return self._seconds[min(self._seconds, key=lambda known: abs(known - _size(query)))]
-
-    def _learn(self, batch: list[Job], taken: float) -> None:
-        """Note the seconds that a batch took, as a moving average; each query's share is as expected."""
+    def _end(self, started: float | None) -> None:
+        """What was begun last is done; `started` is when, where it went well and its time can be learnt from."""
+        now = time.perf_counter()
         with self._changed:
-            expected = [self._expected(job.query) for job in batch]
-            for job, seconds in zip(batch, expected, strict=True):
-                share = max(taken, 1e-6) * seconds / sum(expected)
-                before = self._seconds.setdefault(_size(job.query), share)
-                self._seconds[_size(job.query)] = before + 0.2 * (share - before)
+            ended = self._running.pop()
+            if started is not None:
+                self._costs.learn([job.query for job in ended.batch], now - started - ended.stolen, now)
+
+    def _fail(self, predictor: Predictor, batch: list[Job], error: Exception) -> None:
+        """Tell a job its error; those of a batch are tried each by itself, so that a query's fault is its own."""
+        if len(batch) == 1:
+            late = DeadlineExceeded("The deadline passed while the grasps were computed.")
+            batch[0].future.set_exception(late if isinstance(error, GaveUp) else error)
+            return
+        for job in batch:
+            with self._changed:
+                self._begin([job])
+            self._predict(predictor, [job])
+
+    def _give_up(self, predictor: Predictor, job: Job) -> bool:
+        """Asked by the predictor between stages: whether nobody waits for a job. Cheap ones have their turn here."""
+        while not (over := self._is_over(job)) and (cheap := self._take_between(job)):
+            started = time.perf_counter()
+            self._predict(predictor, [cheap])
+            with self._changed:
+                self._running[-1].stolen += time.perf_counter() - started
+        return over
+
+    def _is_over(self, job: Job) -> bool:
+        return job.forsaken or self._state == "stopped" or time.perf_counter() > job.deadline
+
+    def _take_between(self, job: Job) -> Job | None:
+        """A job that may be predicted in the middle of another, which interrupts nothing itself."""
+        with self._changed:
+            while len(self._running) == 1 and (cheap := self._turns.take_between(job)):
+                if _begins(cheap):
+                    self._begin([cheap])
+                    return cheap
+        return None
+
+
+def _begins(job: Job) -> bool:
+    """Whether somebody still waits for a job whose turn has come; who is late is told so."""
+    if time.perf_counter() > job.latest:
+        job.refuse(DeadlineExceeded("The deadline passed while the request waited for its turn."))
+        return False
+    return job.future.set_running_or_notify_cancel()
 
 
 def _whole_seconds(seconds: float) -> int:
     return max(1, min(60, math.ceil(seconds)))
-
-
-def _size(query: GraspQuery) -> int:
-    """The same for clouds of like size: those of 2^(n-1) to 2^n - 1 points."""
-    return len(query.points).bit_length()

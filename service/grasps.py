@@ -8,8 +8,9 @@ from __future__ import annotations
 
 import asyncio
 import math
+import re
 import time
-from collections.abc import Callable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -21,7 +22,7 @@ from starlette.requests import Request
 from starlette.responses import Response
 
 from service.answers import encoder_for
-from service.batching import Answer, Job, PredictionWorker
+from service.batching import PredictionWorker
 from service.errors import (
     ClientGone,
     DeadlineExceeded,
@@ -30,24 +31,26 @@ from service.errors import (
     UnknownContentType,
     shortened,
 )
-from service.intake import Intake
+from service.intake import announced_bytes, read_body
 from service.metrics import Metrics
 from service.middleware import RequestRecord
 from service.payloads import OCTET_STREAM, build_query, decoder_for, merged, parse_options, parse_query_string
 from service.schemas import MAX_TIMEOUT_S, GraspOptions
 from service.settings import Settings
+from service.turns import Answer, Job
 from tesnet.query import GraspQuery
 from tesnet.result import GraspResult
 
 if TYPE_CHECKING:
     from tesnet.predictor import ModelInfo
 
-CODEC_THREADS = 2
-"""Bodies decoded and answers encoded at once."""
-BODIES_IN_MEMORY = 4
-"""Bodies of the largest size that may be read or decoded at once; smaller ones accordingly more."""
+SMALL_BODY = 2**20
+"""Bytes up to which a body is decoded in a lane where no large one is before it, and up to which a request may be so
+cheap that it has a spare place in the queue."""
 SMALL_ANSWER = 50
 """Grasps that are encoded on the event loop: under a millisecond."""
+
+_SECONDS = re.compile(r"(\d{1,10}(\.\d{0,20})?|\.\d{1,20})([eE][+-]?\d{1,2})?")
 
 Result = TypeVar("Result")
 
@@ -83,8 +86,8 @@ class GraspEndpoint:
         self._settings = settings
         self._worker = worker
         self._metrics = metrics
-        self._intake = Intake(settings.max_body_bytes, BODIES_IN_MEMORY * settings.max_body_bytes)
-        self._threads = ThreadPoolExecutor(CODEC_THREADS, thread_name_prefix="codec")
+        self._small_lane = ThreadPoolExecutor(1, thread_name_prefix="codec of small bodies")
+        self._large_lane = ThreadPoolExecutor(1, thread_name_prefix="codec of large bodies")
         self._draining = False
         self._active = 0
         self._closed = False
@@ -106,7 +109,8 @@ class GraspEndpoint:
 
     def close(self, timeout: float) -> None:
         """Refuse what waits, and give a prediction that runs `timeout` seconds to end."""
-        self._threads.shutdown(wait=False, cancel_futures=True)
+        for lane in (self._small_lane, self._large_lane):
+            lane.shutdown(wait=False, cancel_futures=True)
         self._closed = self._worker.stop(timeout)
 
     def drain(self) -> None:
@@ -141,16 +145,15 @@ class GraspEndpoint:
             ServiceError, InvalidQuery: see the table in `service.errors`.
         """
         with self._admitted(request):
-            read = self.reader(request)
-            async with self._intake.body(request) as body:
-                asked = await self._in_thread(partial(read, body))
+            asked, _ = await self._read(request, self.reader(request))
             return Response(asked.query.points.astype("<f4").tobytes(), media_type=OCTET_STREAM)
 
     @contextmanager
     def _admitted(self, request: Request) -> Iterator[float]:
         """The deadline of a request that is taken, within which the block ends."""
         self.check_ready()
-        self._worker.check_room()
+        announced = announced_bytes(request)
+        self._worker.check_room(self._client(request), may_be_cheap=announced is None or announced <= SMALL_BODY)
         timeout = self._timeout(request)
         deadline = request.state.record.arrived + timeout
         self._active += 1
@@ -172,10 +175,7 @@ class GraspEndpoint:
             self._active -= 1
 
     async def _answer(self, request: Request, record: RequestRecord, read: Reader, deadline: float) -> Response:
-        async with self._intake.body(request) as body:
-            received = time.perf_counter()
-            self._worker.check_room()  # the queue may have filled while the body arrived
-            asked = await self._in_thread(partial(read, body))
+        asked, received = await self._read(request, read)
         decoded = time.perf_counter()
         query = asked.query
         record.fields["points"] = len(query.points)
@@ -196,9 +196,27 @@ class GraspEndpoint:
             timings_ms={stage: round(milliseconds, 3) for stage, milliseconds in timings.items()},
         )
         write = partial(asked.write, result, timings)
-        response = write() if len(result.grasps) <= SMALL_ANSWER else await self._in_thread(write)
+        response = write() if len(result.grasps) <= SMALL_ANSWER else await _in_thread(self._small_lane, write)
         self._metrics.prediction(len(query.points), timings | {"encode": 1e3 * (time.perf_counter() - predicted)})
         return response
+
+    async def _read(self, request: Request, read: Reader) -> tuple[Asked, float]:
+        """What the body asks, and when its last byte came. The body itself is forgotten then: only its cloud waits."""
+        share = request.state.record.share
+        body = await read_body(request, self._settings.max_body_bytes, share)
+        received = time.perf_counter()
+        self._worker.check_room(self._client(request), may_be_cheap=len(body) <= SMALL_BODY)  # it may have filled
+        lane = self._small_lane if len(body) <= SMALL_BODY else self._large_lane
+        asked = await _in_thread(lane, partial(read, body))
+        share.resize(asked.query.nbytes)
+        return asked, received
+
+    def _client(self, request: Request) -> Hashable:
+        """Whose a request is: its API key's, else its address's where that can be believed; None for anybody's."""
+        key: bytes | None = request.state.record.key
+        if key is not None or not self._settings.trusted_proxies or request.client is None:
+            return key
+        return request.client.host
 
     def reader(self, request: Request) -> Reader:
         """Reads the bodies of `POST /grasps`.
@@ -228,7 +246,7 @@ class GraspEndpoint:
 
     async def _predict(self, request: Request, query: GraspQuery, deadline: float, begin_by: float) -> Answer:
         """Queue the query and wait for its answer, or for the client to hang up."""
-        job = self._worker.submit(query, deadline, begin_by)
+        job = self._worker.submit(query, deadline, begin_by, self._client(request))
         answer = asyncio.wrap_future(job.future)
         answer.add_done_callback(_retrieve)  # an error that comes too late is the log's no more than the client's
         gone = asyncio.ensure_future(_hung_up(request))
@@ -246,10 +264,6 @@ class GraspEndpoint:
         if not job.future.done():
             self._worker.cancel(job)
 
-    async def _in_thread(self, work: Callable[[], Result]) -> Result:
-        """The result of work in one of few threads. Who stops waiting leaves it to end there: there are never more."""
-        return await asyncio.wrap_future(self._threads.submit(work))
-
     def _timeout(self, request: Request) -> float:
         """Seconds that the client gives, or the default.
 
@@ -259,15 +273,17 @@ class GraspEndpoint:
         given = request.headers.get("x-request-timeout")
         if given is None:
             return self._settings.request_timeout
-        try:
-            seconds = float(given)
-        except ValueError:
-            seconds = math.nan
+        seconds = float(given) if _SECONDS.fullmatch(given) else math.nan
         if not 0 < seconds <= MAX_TIMEOUT_S:
             raise Invalid(
                 "X-Request-Timeout", f"is {shortened(given)}; give seconds, more than 0 and at most {MAX_TIMEOUT_S:g}"
             )
         return seconds
+
+
+async def _in_thread(lane: ThreadPoolExecutor, work: Callable[[], Result]) -> Result:
+    """The result of work in a lane. Who stops waiting leaves it to end there, or never to begin."""
+    return await asyncio.wrap_future(lane.submit(work))
 
 
 def refuse_compressed(request: Request) -> None:

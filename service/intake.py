@@ -1,59 +1,44 @@
-"""Reads request bodies within limits: bytes of one body, and bytes of all bodies that are being read or decoded."""
+"""Reads request bodies within limits: bytes of one body, and what is held for all requests."""
 
 from __future__ import annotations
 
-from collections.abc import AsyncIterator
-from contextlib import asynccontextmanager
-
 from starlette.requests import ClientDisconnect, Request
 
-from service.errors import ClientGone, QueueFull, TooLarge
+from service.errors import ClientGone, TooLarge
+from service.memory import Share
 
 
-class Intake:
-    """The bodies in memory.
+async def read_body(request: Request, max_bytes: int, share: Share) -> bytearray:
+    """The request's body, which `share` holds from its first byte on.
 
-    Args:
-        max_body_bytes: limit of one body.
-        max_bytes: limit of all bodies together.
+    Raises:
+        TooLarge: at the announced length, or at the first byte too many of a body that announces none.
+        QueueFull: too much is held for other requests.
+        ClientGone: the client hung up in the middle.
     """
+    announced = announced_bytes(request)
+    if announced is not None and announced > max_bytes:
+        raise _too_large(f"{announced} bytes", max_bytes)
+    body = bytearray()
+    try:
+        async for chunk in request.stream():
+            if len(body) + len(chunk) > max_bytes:
+                raise _too_large("more bytes", max_bytes)
+            share.resize(len(body) + len(chunk))
+            body += chunk
+    except ClientDisconnect:
+        raise ClientGone("The client closed the connection while its body was read.") from None
+    return body
 
-    def __init__(self, max_body_bytes: int, max_bytes: int) -> None:
-        self._max_body_bytes = max_body_bytes
-        self._max_bytes = max_bytes
-        self._held = 0
 
-    @asynccontextmanager
-    async def body(self, request: Request) -> AsyncIterator[bytearray]:
-        """The request's body; its bytes count until the block is left.
+def announced_bytes(request: Request) -> int | None:
+    """The length that a request's head tells, None where it tells none; no more digits than a length can have."""
+    announced = request.headers.get("content-length", "")
+    return int(announced[:20]) if announced.isdecimal() else None
 
-        Raises:
-            TooLarge: at the announced length, or at the first byte too many of a body that announces none.
-            QueueFull: too many bodies at once.
-            ClientGone: the client hung up in the middle.
-        """
-        announced = request.headers.get("content-length", "")
-        if announced.isdecimal() and int(announced) > self._max_body_bytes:
-            raise self._too_large(f"{announced} bytes")
-        body = bytearray()
-        try:
-            async for chunk in request.stream():
-                self._held += len(chunk)
-                body += chunk
-                if len(body) > self._max_body_bytes:
-                    raise self._too_large("more bytes")
-                if self._held > self._max_bytes:
-                    raise QueueFull(
-                        "Too many large bodies arrive at once; repeat the request after 1 s.", retry_after=1
-                    )
-            yield body
-        except ClientDisconnect:
-            raise ClientGone("The client closed the connection while its body was read.") from None
-        finally:
-            self._held -= len(body)
 
-    def _too_large(self, size: str) -> TooLarge:
-        return TooLarge(
-            f"The body has {size} (limit {self._max_body_bytes}); crop or downsample the cloud, or send it as "
-            "application/octet-stream, 12 bytes a point."
-        )
+def _too_large(size: str, limit: int) -> TooLarge:
+    return TooLarge(
+        f"The body has {size} (limit {limit}); crop or downsample the cloud, or send it as "
+        "application/octet-stream, 12 bytes a point."
+    )

@@ -15,7 +15,8 @@ from typing import Any
 
 import msgspec
 
-QUEUED_LINES = 10_000
+QUEUED_BYTES = 4 * 2**20
+"""Of lines that wait to be written."""
 CLOSE_SECONDS = 2.0
 """For the last lines to be written, when the process ends."""
 
@@ -48,35 +49,39 @@ class BackgroundHandler(logging.Handler):
         super().__init__()
         self._descriptor = descriptor
         self._lost = 0
+        self._queued = 0  # bytes
         self._counting = threading.Lock()
-        self._lines: queue.Queue[str | None] = queue.Queue(QUEUED_LINES)
+        self._lines: queue.SimpleQueue[bytes | None] = queue.SimpleQueue()
         self._thread = threading.Thread(target=self._write_all, name="log", daemon=True)
         self._thread.start()
 
     def emit(self, record: logging.LogRecord) -> None:
         """Queue a record's line."""
-        self._put(self.format(record))
+        line = f"{self.format(record)}\n".encode()
+        with self._counting:
+            if self._queued + len(line) > QUEUED_BYTES:
+                self._lost += 1
+                return
+            self._queued += len(line)
+        self._lines.put(line)
 
     def close(self) -> None:
         """Write what is queued, for at most `CLOSE_SECONDS`."""
         if self._thread.is_alive():
-            self._put(None)
+            self._lines.put(None)
             self._thread.join(CLOSE_SECONDS)
         super().close()
 
-    def _put(self, line: str | None) -> None:
-        try:
-            self._lines.put_nowait(line)
-        except queue.Full:
-            self._count(1)
-
     def _write_all(self) -> None:
         while (line := self._lines.get()) is not None:
-            if not self._write(line):
+            written = self._write(line)
+            with self._counting:
+                self._queued -= len(line)
+            if not written:
                 self._count(1)
             elif lost := self._counted():
                 values = {"name": __name__, "levelname": "WARNING", "msg": "log lines lost", "fields": {"lines": lost}}
-                if not self._write(self.format(logging.makeLogRecord(values))):
+                if not self._write(f"{self.format(logging.makeLogRecord(values))}\n".encode()):
                     self._count(lost)
 
     def _count(self, lost: int) -> None:
@@ -89,8 +94,8 @@ class BackgroundHandler(logging.Handler):
             lost, self._lost = self._lost, 0
         return lost
 
-    def _write(self, line: str) -> bool:
-        rest = memoryview(f"{line}\n".encode())
+    def _write(self, line: bytes) -> bool:
+        rest = memoryview(line)
         try:
             while rest:
                 rest = rest[os.write(self._descriptor, rest) :]

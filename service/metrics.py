@@ -52,7 +52,13 @@ class Metrics:
             "grasp_batch_size", "Clouds predicted together.", buckets=BATCHES, registry=self._registry
         )
 
-    def watch(self, queue_depth: Callable[[], int], active: Callable[[], int], is_ready: Callable[[], bool]) -> None:
+    def watch(
+        self,
+        queue_depth: Callable[[], int],
+        active: Callable[[], int],
+        is_ready: Callable[[], bool],
+        held_bytes: Callable[[], int],
+    ) -> None:
         """Read these whenever Prometheus asks."""
         Gauge("grasp_queue_depth", "Requests that wait for the predictor.", registry=self._registry).set_function(
             queue_depth
@@ -62,6 +68,11 @@ class Metrics:
             "Requests for grasps that are being read, wait or are predicted.",
             registry=self._registry,
         ).set_function(active)
+        Gauge(
+            "grasp_held_bytes",
+            "Bytes of bodies, clouds that wait and answers on their way.",
+            registry=self._registry,
+        ).set_function(held_bytes)
         Gauge("grasp_ready", "1 when requests are taken.", registry=self._registry).set_function(is_ready)
 
     def request(self, method: str, route: str, status: int, seconds: float) -> None:

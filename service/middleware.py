@@ -14,7 +14,8 @@ import anyio
 from starlette.datastructures import Headers, MutableHeaders
 from starlette.types import ASGIApp, Message, Receive, Scope, Send
 
-from service.errors import NotReady, problem_response
+from service.errors import NotReady, problem_response, shortened
+from service.memory import Memory, Share
 from service.metrics import Metrics
 from service.schemas import REQUEST_ID
 
@@ -22,6 +23,9 @@ log = logging.getLogger("service.request")
 
 COUNTED_METHODS = frozenset({"GET", "HEAD", "POST", "PUT", "PATCH", "DELETE", "OPTIONS"})
 """Any other would be a label that a client makes up; Prometheus keeps a series for each."""
+
+LOGGED_PATH, LOGGED_METHOD = 200, 20
+"""Characters of what a client makes up that a log line repeats."""
 
 LINGER_SECONDS = 5.0
 LINGER_BYTES = 128 * 2**20
@@ -34,11 +38,14 @@ class RequestRecord:
 
     request_id: str
     arrived: float
+    share: Share
     fields: dict[str, Any] = field(default_factory=dict)
     bytes_in: int = 0
     asked_for_body: bool = False
     body_complete: bool = False
     status: int = 0
+    key: bytes | None = None
+    """The digest of its API key."""
 
 
 class RequestMiddleware:
@@ -47,11 +54,13 @@ class RequestMiddleware:
     Args:
         app: the application inside.
         metrics: counts requests.
+        memory: what is held for them.
     """
 
-    def __init__(self, app: ASGIApp, metrics: Metrics) -> None:
+    def __init__(self, app: ASGIApp, metrics: Metrics, memory: Memory) -> None:
         self._app = app
         self._metrics = metrics
+        self._memory = memory
 
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
@@ -59,7 +68,7 @@ class RequestMiddleware:
             await self._app(scope, receive, send)
             return
         headers = Headers(scope=scope)
-        record = RequestRecord(request_id_of(headers.get("x-request-id")), time.perf_counter())
+        record = RequestRecord(request_id_of(headers.get("x-request-id")), time.perf_counter(), self._memory.share())
         scope.setdefault("state", {})["record"] = record
         record.body_complete = not _announces_body(headers)
 
@@ -76,7 +85,7 @@ class RequestMiddleware:
                 record.status = message["status"]
                 answer_headers = MutableHeaders(scope=message)
                 answer_headers["X-Request-ID"] = record.request_id
-                if not record.body_complete:
+                if not record.body_complete or _is_ambiguous(headers):
                     answer_headers["Connection"] = "close"
             elif not message.get("more_body", False) and not record.body_complete:
                 await send({**message, "more_body": True})
@@ -95,20 +104,22 @@ class RequestMiddleware:
                 raise
             await problem_response(error, scope)(scope, receiving, sending)
         finally:
+            record.share.release()
             self._finish(scope, record)
 
     def _finish(self, scope: Scope, record: RequestRecord) -> None:
         seconds = time.perf_counter() - record.arrived
         route = getattr(scope.get("route"), "path", "other")
-        method = scope["method"] if scope["method"] in COUNTED_METHODS else "other"
+        is_known = scope["method"] in COUNTED_METHODS
+        method = scope["method"] if is_known else "other"
         self._metrics.request(method, route, record.status, seconds)
         log.info(
             "request",
             extra={
                 "fields": {
                     "request_id": record.request_id,
-                    "method": scope["method"],
-                    "path": scope["path"],
+                    "method": scope["method"] if is_known else shortened(scope["method"], LOGGED_METHOD),
+                    "path": shortened(scope["path"], LOGGED_PATH),
                     "status": record.status,
                     "duration_ms": round(1e3 * seconds, 3),
                     "bytes_in": record.bytes_in,
@@ -123,6 +134,11 @@ def request_id_of(given: str | None) -> str:
     if given and re.fullmatch(REQUEST_ID, given):
         return given
     return uuid.uuid4().hex
+
+
+def _is_ambiguous(headers: Headers) -> bool:
+    """Whether a body has two lengths, which others on the way may read differently (RFC 9112, 6.1)."""
+    return "transfer-encoding" in headers and "content-length" in headers
 
 
 def _announces_body(headers: Headers) -> bool:

@@ -39,6 +39,7 @@ def main() -> int:
 
     0: ended as asked. 1: the predictor could not be loaded. 2: a setting, the command line or the port is wrong.
     """
+    _open_standard_files()
     _parser().parse_args()
     started = time.perf_counter()
     _allow_many_connections()
@@ -86,7 +87,9 @@ def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
     config = uvicorn.Config(
         app,
         loop="asyncio",  # named, because uvicorn would take another where it happens to be installed
-        http=PunctualProtocol,
+        http=PunctualProtocol.over(app.state.memory),
+        proxy_headers=bool(settings.trusted_proxies),
+        forwarded_allow_ips=list(settings.trusted_proxies),
         log_config=None,
         access_log=False,
         ws="none",
@@ -104,6 +107,15 @@ def _serve(settings: Settings, listener: socket.socket, started: float) -> int:
         logging.shutdown()
         os._exit(0)
     return 0
+
+
+def _open_standard_files() -> None:
+    """Give those that whoever started the process has closed to nobody, or the next socket would get their numbers."""
+    while (descriptor := os.open(os.devnull, os.O_RDWR)) < 3:  # each gets the lowest free number
+        pass
+    os.close(descriptor)
+    sys.stdout = sys.stdout or os.fdopen(1, "w")
+    sys.stderr = sys.stderr or os.fdopen(2, "w")
 
 
 def _allow_many_connections() -> None:

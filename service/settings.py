@@ -6,6 +6,7 @@ Of the machine it asks how many cores the process may use, which is how many thr
 from __future__ import annotations
 
 import difflib
+import ipaddress
 import math
 import os
 import re
@@ -84,6 +85,13 @@ class Settings(BaseModel):
     max_body_mb: float = Field(
         default=64.0, gt=0, le=4096, description="MiB in a request's body, more than 0, at most 4096."
     )
+    max_held_mb: float = Field(
+        default=512.0,
+        gt=0,
+        le=1_048_576,
+        description="MiB held for all requests together: bodies, clouds that wait, answers on their way; more than "
+        "0. A lone request is always taken.",
+    )
     queue_size: int = Field(
         default=32, ge=1, le=10_000, description="Requests that may wait for the predictor, 1 to 10,000."
     )
@@ -92,6 +100,18 @@ class Settings(BaseModel):
         ge=1,
         le=64,
         description="Waiting requests predicted together, 1 to 64; more than 1 does not pay on a CPU.",
+    )
+    client_places: int | None = Field(
+        default=None,
+        ge=1,
+        le=10_000,
+        description="Requests of one client that may wait, 1 to 10,000, where clients are known: by their API key, of "
+        "which there is more than one, or behind trusted proxies by their address. Default: half of GRASP_QUEUE_SIZE.",
+    )
+    trusted_proxies: tuple[str, ...] = Field(
+        default=(),
+        description="Addresses or networks of proxies, separated by commas (10.0.0.0/8), whose X-Forwarded-For tells "
+        "whose a request is. Default: none, and addresses mean nothing.",
     )
     request_timeout: float = Field(
         default=30.0,
@@ -124,7 +144,7 @@ class Settings(BaseModel):
     def _lower_case(cls, value: object) -> object:
         return value.strip().lower() if isinstance(value, str) else value
 
-    @field_validator("api_keys", "cors_origins", mode="before")
+    @field_validator("api_keys", "cors_origins", "trusted_proxies", mode="before")
     @classmethod
     def _split(cls, value: object) -> object:
         return [part.strip() for part in value.split(",")] if isinstance(value, str) else value
@@ -142,6 +162,25 @@ class Settings(BaseModel):
         if not all(re.fullmatch(r"\*|https?://[^/\s]+", origin) for origin in origins):
             raise ValueError("no origin")
         return origins
+
+    @field_validator("trusted_proxies")
+    @classmethod
+    def _networks(cls, proxies: tuple[str, ...]) -> tuple[str, ...]:
+        for proxy in proxies:
+            ipaddress.ip_network(proxy)
+        return proxies
+
+    @property
+    def places_of_a_client(self) -> int | None:
+        """Requests of one client that may wait; None where clients are not told apart."""
+        if len(self.api_keys) < 2 and not self.trusted_proxies:
+            return None
+        return self.client_places or max(1, self.queue_size // 2)
+
+    @property
+    def max_held_bytes(self) -> int:
+        """Bytes held for all requests together."""
+        return int(self.max_held_mb * 2**20)
 
     @property
     def max_body_bytes(self) -> int:

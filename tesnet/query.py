@@ -70,6 +70,11 @@ class GraspQuery:
     unseen: Literal["free", "occupied"] = "free"
     seed: int = 0
 
+    @property
+    def nbytes(self) -> int:
+        """Bytes of its arrays that grow with the cloud."""
+        return self.points.nbytes + (self.target.nbytes if isinstance(self.target, np.ndarray) else 0)
+
     def __post_init__(self) -> None:
         object.__setattr__(self, "points", _cloud(self.points))
         if self.viewpoints is not None:

@@ -14,6 +14,7 @@ if __name__ == "__main__":
 
 import argparse
 import logging
+import math
 import os
 import signal
 import sys
@@ -34,6 +35,7 @@ from starlette.types import ASGIApp, Message, Receive, Scope, Send
 from service.deploy.replicas import Replicas, option_name, replica_settings, replicas_from
 from service.errors import PROBLEM_JSON, NotReady, problem_response
 from service.logs import configure_logging
+from service.memory import Memory
 from service.middleware import RequestRecord, request_id_of
 from service.protocol import KEEP_ALIVE_SECONDS
 from service.settings import InvalidSetting, Settings, load_settings, service_version
@@ -161,7 +163,9 @@ class _AroundProxy:
     async def __call__(self, scope: Scope, receive: Receive, send: Send) -> None:
         """Answer one request."""
         headers = MutableHeaders(scope=scope)
-        record = RequestRecord(request_id_of(headers.get("X-Request-ID")), time.perf_counter())
+        record = RequestRecord(
+            request_id_of(headers.get("X-Request-ID")), time.perf_counter(), Memory(math.inf).share()
+        )
         headers["X-Request-ID"] = record.request_id
         refused = False
 

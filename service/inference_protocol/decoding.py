@@ -199,7 +199,7 @@ def _points(inputs: Span | None, tail: memoryview, max_points: int) -> Points:
         raise Invalid("inputs", f"hold {what}; give {INPUT.name} of {INPUT.datatype}")
     count, width = given.shape
     if count < 0 or width != 3:
-        raise Invalid("inputs", f"have shape [{count}, {width}]; give [N, 3]")
+        raise Invalid("inputs", f"have shape {shortened(str([count, width]))}; give [N, 3]")
     check_count(count, max_points)
     size = given.parameters.binary_data_size if given.parameters else None
     if size is not None and data is None:
@@ -217,8 +217,8 @@ def _points(inputs: Span | None, tail: memoryview, max_points: int) -> Points:
 def _binary_points(tail: memoryview, count: int, size: int) -> Points:
     if not size == len(tail) == 12 * count:
         raise Undecodable(
-            f"binary_data_size is {size}, {len(tail)} bytes follow the JSON, and shape [{count}, 3] of FP32 needs "
-            f"{12 * count}; the three must agree."
+            f"binary_data_size is {shortened(str(size))}, {len(tail)} bytes follow the JSON, and shape [{count}, 3] of "
+            f"FP32 needs {12 * count}; the three must agree."
         )
     return np.frombuffer(tail, "<f4").reshape(-1, 3)
 

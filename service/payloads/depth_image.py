@@ -21,7 +21,7 @@ PIXELS_PER_POINT = 4
 """An image may have so many times the pixels of the largest cloud: many of them have no depth."""
 
 _GRAYSCALE = 0
-_HEAD = struct.Struct(">8sI4sIIBB")
+_HEAD = struct.Struct(">8sI4sIIBBBBB")
 _SIGNATURE = b"\x89PNG\r\n\x1a\n"
 
 
@@ -110,8 +110,11 @@ def _pixels(file: memoryview, name: str, bits: tuple[int, ...], max_pixels: int)
 def _head(file: memoryview, name: str) -> _Head:
     """What the PNG's first chunk says (PNG specification, 11.2.2)."""
     if len(file) >= _HEAD.size:
-        signature, _, chunk, width, height, bits, colours = _HEAD.unpack_from(file)
+        signature, _, chunk, width, height, bits, colours, *methods, interlaced = _HEAD.unpack_from(file)
         if signature == _SIGNATURE and chunk == b"IHDR" and width > 0 and height > 0:
+            if methods != [0, 0] or interlaced > 1:  # compression and filter: there are no others
+                what = f"{methods[0]}, {methods[1]} and {interlaced}"
+                raise Undecodable(f"The PNG `{name}` says it is compressed, filtered and interlaced by methods {what}.")
             return _Head(width, height, bits, colours)
     raise Undecodable(f"The file `{name}` does not begin like a PNG; send one.")
 

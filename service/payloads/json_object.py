@@ -31,7 +31,7 @@ NOT_UTF8 = "The JSON is not UTF-8; encode it so."
 
 _SPACE = re.compile(rb"[ \t\r\n]*")
 _NAME = re.compile(rb'"(?:[^"\\]|\\.){0,400}"', re.DOTALL)
-_SCALAR = re.compile(rb'[^ \t\r\n,:"{}\[\]]{1,1000}')
+_SCALAR = re.compile(rb'[^ \t\r\n,:"{}\[\]]{1,65536}')
 _COMMA = re.compile(rb",(?=[ \t\r\n]*[^ \t\r\n\]])")
 _ROW_END = re.compile(rb"\][ \t\r\n]*,(?=[ \t\r\n]*[^ \t\r\n\]])")
 """Where an array may be cut: at a comma that something follows."""
@@ -272,13 +272,24 @@ def _string_end(text: bytes | bytearray, start: int, end: int, what: str) -> int
         quote = text.find(b'"', at, end)
         if quote < 0:
             raise _broken(what, end, end)
-        before = quote
-        while before > at and text[before - 1] == ord("\\"):
-            before -= 1
+        escapes = _backslashes(text, at, quote)
         at = quote + 1
-        if (quote - before) % 2 == 0:
+        if escapes % 2 == 0:
             return at
     raise Invalid(what, f"has a string of more than {MAX_MARKS} quotes; send arrays of numbers")
+
+
+def _backslashes(text: bytes | bytearray, start: int, end: int) -> int:
+    """How many of them stand right before `end`, none of them before `start`."""
+    count, step = 0, 16
+    while True:
+        part = text[max(start, end - step) : end]
+        found = len(part) - len(part.rstrip(b"\\"))
+        count += found
+        if found < step:
+            return count
+        end -= step
+        step = min(2 * step, _STEP)
 
 
 def _byte(text: bytes | bytearray, at: int, end: int) -> bytes | bytearray:

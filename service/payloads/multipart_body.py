@@ -3,7 +3,6 @@
 from __future__ import annotations
 
 from collections.abc import Mapping
-from typing import cast
 
 from python_multipart.exceptions import FormParserError
 from python_multipart.multipart import MultipartParser, parse_options_header
@@ -20,6 +19,10 @@ from tesnet import formats
 FILES = ("cloud", "depth", "mask")
 PARTS = frozenset((*FILES, "options", *DepthOptions.model_fields))
 """Each option may also be a part of its own."""
+
+_STEP = 1 << 16
+"""Bytes that the parser is given in one go."""
+_MAX_HEADER_BYTES = 4096
 
 
 def decode_multipart(boundary: bytes, body: bytearray, max_points: int) -> Payload:
@@ -93,7 +96,9 @@ def _split(boundary: bytes, body: bytearray) -> dict[str, Span]:
         },
     )
     try:
-        parser.write(cast("bytes", body))  # it only slices and searches
+        for start in range(0, len(body), _STEP):
+            form.offset = start
+            parser.write(bytes(memoryview(body)[start : start + _STEP]))
     except FormParserError as error:
         raise Undecodable(f"The form cannot be read: {shortened(str(error))}.") from None
     if not form.complete:
@@ -107,6 +112,8 @@ class _Form:
     def __init__(self, body: bytearray) -> None:
         self.parts: dict[str, Span] = {}
         self.complete = False
+        self.offset = 0
+        """Of what the parser is at, in the body."""
         self._body = body
         self.begin_part()
 
@@ -118,10 +125,17 @@ class _Form:
         self._end = 0
 
     def add_header_name(self, data: bytes, start: int, end: int) -> None:
-        self._header_name += data[start:end]
+        self._header_name += self._bounded(self._header_name, data[start:end])
 
     def add_header_value(self, data: bytes, start: int, end: int) -> None:
-        self._header_value += data[start:end]
+        self._header_value += self._bounded(self._header_value, data[start:end])
+
+    @staticmethod
+    def _bounded(before: bytearray, more: bytes) -> bytes:
+        """What a header goes on with: byte for byte is how it is read, so a long one would take long."""
+        if len(before) + len(more) > _MAX_HEADER_BYTES:
+            raise Undecodable(f"A header of the form has more than {_MAX_HEADER_BYTES} bytes; shorten it.")
+        return more
 
     def end_header(self) -> None:
         if self._header_name.lower() == b"content-disposition":
@@ -140,8 +154,8 @@ class _Form:
 
     def add_content(self, _: bytes, start: int, end: int) -> None:
         if self._start is None:
-            self._start = start
-        self._end = end
+            self._start = self.offset + start
+        self._end = self.offset + end
 
     def end_part(self) -> None:
         self.parts[self._name] = Span(self._body, self._start or 0, self._end)

@@ -17,9 +17,12 @@ from numpy.typing import NDArray
 
 from service.app import create_app
 from service.grasps import GraspEndpoint
+from service.memory import Memory
 from service.protocol import PunctualProtocol
 from service.settings import Settings
+from tesnet.errors import GaveUp
 from tesnet.geometry import GraspSet
+from tesnet.predictor import GiveUp
 from tesnet.query import GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult
 from tests.conftest import PATIENCE_S
@@ -59,6 +62,7 @@ class GatedPredictor:
     seeds: list[int] = field(default_factory=list)
     fault: Exception | None = None
     batches: list[int] = field(default_factory=list)
+    given_up: list[int] = field(default_factory=list)
 
     device = "cpu"
 
@@ -69,9 +73,16 @@ class GatedPredictor:
     def warm_up(self) -> None:
         pass
 
-    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[GraspResult]:
+    def predict_batch(
+        self, queries: Sequence[GraspQuery], give_up: Sequence[GiveUp | None] | None = None
+    ) -> list[GraspResult]:
         self.batches.append(len(queries))
-        return [self._predict(query) for query in queries]
+        results = [self._predict(query) for query in queries]
+        for asked in give_up or ():
+            if asked is not None and asked():
+                self.given_up.append(self.seeds[-1])
+                raise GaveUp
+        return results
 
     def _predict(self, query: GraspQuery) -> GraspResult:
         self.entered.release()
@@ -100,6 +111,7 @@ class LocalServer:
     url: str
     predictor: GatedPredictor
     endpoint: GraspEndpoint
+    memory: Memory
 
 
 @pytest.fixture
@@ -112,12 +124,16 @@ def serve() -> Iterator[Callable[..., LocalServer]]:
         ready = threading.Event()
         app = create_app(Settings(**{"request_timeout": PATIENCE_S, **settings}), lambda: predictor, on_ready=ready.set)
         listener = socket.create_server(("127.0.0.1", 0))
-        server = uvicorn.Server(uvicorn.Config(app, http=protocol, log_config=None, access_log=False, ws="none"))
+        server = uvicorn.Server(
+            uvicorn.Config(app, http=protocol.over(app.state.memory), log_config=None, access_log=False, ws="none")
+        )
         thread = threading.Thread(target=server.run, kwargs={"sockets": [listener]})
         thread.start()
         started.append((predictor, server, thread))
         assert ready.wait(PATIENCE_S)
-        return LocalServer(f"http://127.0.0.1:{listener.getsockname()[1]}", predictor, app.state.endpoint)
+        return LocalServer(
+            f"http://127.0.0.1:{listener.getsockname()[1]}", predictor, app.state.endpoint, app.state.memory
+        )
 
     yield start
     for predictor, server, thread in started:

@@ -6,6 +6,7 @@ import threading
 import time
 from collections.abc import Callable, Iterator, Sequence
 from concurrent.futures import CancelledError
+from contextlib import suppress
 from typing import Any
 
 import numpy as np
@@ -13,7 +14,9 @@ import pytest
 
 from service import batching
 from service.batching import PredictionWorker
+from service.cost import REMEMBERED_S
 from service.errors import DeadlineExceeded, NotReady, QueueFull
+from tesnet.errors import GaveUp
 from tesnet.query import GraspQuery
 from tests.conftest import PATIENCE_S
 
@@ -32,7 +35,7 @@ class Echo:
     def warm_up(self) -> None:
         assert threading.current_thread() is self.made_in
 
-    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[Any]:
+    def predict_batch(self, queries: Sequence[GraspQuery], give_up: Any = None) -> list[Any]:
         self.entered.release()
         assert self.gate.wait(PATIENCE_S)
         if any(query.seed == 13 for query in queries):
@@ -171,7 +174,10 @@ def test_a_query_whose_turn_would_come_after_its_deadline_is_refused_at_once(
 
 
 class Timed:
-    """Takes 1 s for a thousand points, on a clock that nothing else moves; holds each query at its gate."""
+    """Takes 1 s for a thousand points, on a clock that nothing else moves; holds each query at its gate.
+
+    A query of 4,000 points asks halfway whether to go on.
+    """
 
     model: Any = "a model"
     device = "cpu"
@@ -180,6 +186,7 @@ class Timed:
     def __init__(self) -> None:
         self.gate = threading.Semaphore(0)
         self.entered = threading.Semaphore(0)
+        self.order: list[int] = []
 
     def perf_counter(self) -> float:
         return self.now
@@ -187,20 +194,25 @@ class Timed:
     def warm_up(self) -> None:
         pass
 
-    def predict_batch(self, queries: Sequence[GraspQuery]) -> list[Any]:
+    def predict_batch(self, queries: Sequence[GraspQuery], give_up: Any = None) -> list[Any]:
         self.entered.release()
         assert self.gate.acquire(timeout=PATIENCE_S)
-        self.now += sum(len(query.points) for query in queries) / 1000
+        seconds = sum(len(query.points) for query in queries) / 1000
+        self.now += seconds / 2
+        if seconds >= 4 and any(asked() for asked in give_up):
+            raise GaveUp
+        self.now += seconds / 2
+        self.order += [query.seed for query in queries]
         return [None for _ in queries]
 
 
-def cloud_of(points: int) -> GraspQuery:
-    return GraspQuery(np.zeros((points, 3), np.float32))
+def cloud_of(points: int, seed: int = 0) -> GraspQuery:
+    return GraspQuery(np.zeros((points, 3), np.float32), seed=seed)
 
 
 @pytest.fixture
 def timed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Timed, PredictionWorker]]:
-    """A worker that has predicted a cloud of 4,000 points and one of 1,000, and is predicting one of 1,000."""
+    """A worker that has predicted a cloud of 4,000 points and one of 1,000, and is free."""
     predictor, ready = Timed(), threading.Event()
     monkeypatch.setattr(batching, "time", predictor)
     worker = PredictionWorker(lambda: predictor, capacity=8, on_ready=ready.set)
@@ -211,30 +223,40 @@ def timed(monkeypatch: pytest.MonkeyPatch) -> Iterator[tuple[Timed, PredictionWo
         predictor.gate.release()
         job.future.result(PATIENCE_S)
         assert predictor.entered.acquire(timeout=PATIENCE_S)
-    worker.submit(cloud_of(1000))
-    assert predictor.entered.acquire(timeout=PATIENCE_S)
+    predictor.order.clear()
     yield predictor, worker
-    for _ in range(8):
+    for _ in range(20):
         predictor.gate.release()
     worker.stop()
 
 
-def test_how_long_to_wait_follows_the_size_of_the_clouds_that_wait(timed: tuple[Timed, PredictionWorker]) -> None:
+@pytest.fixture
+def busy(timed: tuple[Timed, PredictionWorker]) -> tuple[Timed, PredictionWorker]:
+    """The same, predicting a cloud of 1,000 points."""
     predictor, worker = timed
+    worker.submit(cloud_of(1000))
+    assert predictor.entered.acquire(timeout=PATIENCE_S)
+    return predictor, worker
+
+
+def test_how_long_to_wait_follows_what_was_measured_of_the_clouds_that_wait(
+    busy: tuple[Timed, PredictionWorker],
+) -> None:
+    predictor, worker = busy
     assert worker.expected_wait == pytest.approx(1)
-    worker.submit(cloud_of(900))
-    worker.submit(cloud_of(700))
+    worker.submit(cloud_of(1000))
+    worker.submit(cloud_of(1000))
     assert worker.expected_wait == pytest.approx(3)  # though the largest cloud took 4 s
     worker.submit(cloud_of(4000))
-    assert worker.retry_after == 7
+    assert worker.expected_wait == pytest.approx(7)
     predictor.now += 0.5  # of the second that is being predicted
     assert worker.expected_wait == pytest.approx(6.5)
 
 
 def test_a_query_that_would_end_after_its_deadline_is_refused_though_its_turn_would_come_before(
-    timed: tuple[Timed, PredictionWorker],
+    busy: tuple[Timed, PredictionWorker],
 ) -> None:
-    predictor, worker = timed
+    predictor, worker = busy
     with pytest.raises(QueueFull, match=r"busy for some 1\.0 s.*of some 4\.0 s.*within 0\.5 s"):
         worker.submit(cloud_of(4000), deadline=predictor.now + 4.5)
     for _ in range(4):
@@ -244,33 +266,113 @@ def test_a_query_that_would_end_after_its_deadline_is_refused_though_its_turn_wo
     assert refused.value.retry_after == 3  # seconds after which the same request would be in time
 
 
-def test_the_time_to_begin_by_is_that_of_the_wait_alone(timed: tuple[Timed, PredictionWorker]) -> None:
-    predictor, worker = timed
+def test_the_time_to_begin_by_is_that_of_the_wait_alone(busy: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = busy
     worker.submit(cloud_of(4000), begin_by=predictor.now + 1.5)
     with pytest.raises(QueueFull):
-        worker.submit(cloud_of(1000), begin_by=predictor.now + 4.5)
+        worker.submit(cloud_of(4000), begin_by=predictor.now + 4.5)
 
 
-def test_a_free_predictor_tries_a_query_that_should_take_too_long(timed: tuple[Timed, PredictionWorker]) -> None:
+def test_an_idle_predictor_takes_a_query_that_should_take_too_long(timed: tuple[Timed, PredictionWorker]) -> None:
     predictor, worker = timed
-    predictor.now += 1  # what is being predicted should be done
+    worker.submit(cloud_of(4000), deadline=predictor.now + 0.5)
+    assert predictor.entered.acquire(timeout=PATIENCE_S)
+
+
+def test_a_predictor_that_should_be_done_takes_one_too(busy: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = busy
+    predictor.now += 1
     worker.submit(cloud_of(4000), deadline=predictor.now + 0.5)
     assert worker.depth == 1
 
 
-def test_a_wrong_guess_at_a_querys_own_time_does_not_refuse_it_for_ever(timed: tuple[Timed, PredictionWorker]) -> None:
-    """As after one slow prediction, while clouds of another size keep the predictor busy."""
+def test_whoever_hears_of_an_answer_finds_the_predictor_free(timed: tuple[Timed, PredictionWorker]) -> None:
+    """A lone client that asks one request after the other is never told that the queue is full."""
     predictor, worker = timed
+    waits: list[float] = []
+    for _ in range(200):
+        job = worker.submit(cloud_of(1000), deadline=predictor.now + 0.1)
+        job.future.add_done_callback(lambda _: waits.append(worker.expected_wait))
+        predictor.gate.release()
+        with suppress(DeadlineExceeded):
+            job.future.result(PATIENCE_S)
+        assert worker.expected_wait == 0
+    assert waits == [0.0] * 200
 
-    def taken() -> bool:
-        try:
+
+def test_a_refusal_changes_nothing_that_was_learnt(busy: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = busy
+    said = set()
+    for _ in range(30):
+        with pytest.raises(QueueFull) as refused:
             worker.submit(cloud_of(4000), deadline=predictor.now + 2)
-        except QueueFull:
-            return False
-        return True
+        said.add(str(refused.value))
+    assert len(said) == 1
 
-    assert not taken()
-    assert any(taken() for _ in range(20))
+
+def test_a_wrong_guess_at_a_querys_own_time_does_not_refuse_it_for_ever(busy: tuple[Timed, PredictionWorker]) -> None:
+    """As after one slow prediction, while clouds of another size keep the predictor busy."""
+    predictor, worker = busy
+    with pytest.raises(QueueFull):
+        worker.submit(cloud_of(4000), deadline=predictor.now + 2)
+    predictor.now += REMEMBERED_S
+    worker.submit(cloud_of(1000))
+    worker.submit(cloud_of(4000), deadline=predictor.now + 2)
+
+
+def test_cheap_queries_pass_expensive_ones_and_one_another_in_order(busy: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = busy
+    jobs = [worker.submit(cloud_of(points, seed)) for seed, points in enumerate((4000, 4000, 1000, 1000), start=1)]
+    predictor.gate.release(5)
+    for job in jobs:
+        job.future.result(PATIENCE_S)
+    assert predictor.order == [0, 3, 4, 1, 2]
+
+
+def test_a_much_cheaper_query_has_its_turn_in_the_middle_of_an_expensive_one(
+    timed: tuple[Timed, PredictionWorker],
+) -> None:
+    predictor, worker = timed
+    expensive = worker.submit(cloud_of(4000, seed=1))
+    assert predictor.entered.acquire(timeout=PATIENCE_S)
+    cheap, dear = worker.submit(cloud_of(500, seed=2)), worker.submit(cloud_of(4000, seed=3))
+    predictor.gate.release(3)
+    for job in (expensive, cheap, dear):
+        job.future.result(PATIENCE_S)
+    assert predictor.order == [2, 1, 3]
+    worker.submit(cloud_of(4000))
+    assert worker.expected_wait == pytest.approx(4)  # the time that another took in its middle was not learnt
+
+
+def test_what_nobody_waits_for_is_given_up(timed: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = timed
+    forsaken = worker.submit(cloud_of(4000, seed=1))
+    assert predictor.entered.acquire(timeout=PATIENCE_S)
+    worker.cancel(forsaken)
+    late = worker.submit(cloud_of(4000, seed=2), deadline=predictor.now + 9)
+    served = worker.submit(cloud_of(4000, seed=3))
+    predictor.now += 6
+    predictor.gate.release(3)
+    served.future.result(PATIENCE_S)
+    assert predictor.order == [3]
+    for job in (forsaken, late):
+        with pytest.raises(DeadlineExceeded):
+            job.future.result(PATIENCE_S)
+
+
+def test_one_client_has_no_more_places_than_it_may(start: StartWorker, made: list[Echo], query: GraspQuery) -> None:
+    worker = start(capacity=8, client_capacity=2)
+    worker.submit(query, client="a")
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
+    first, _ = worker.submit(query, client="a"), worker.submit(query, client="a")
+    with pytest.raises(QueueFull, match="2 requests of yours wait"):
+        worker.submit(query, client="a")
+    with pytest.raises(QueueFull, match="2 requests of yours wait"):
+        worker.check_room("a")
+    worker.submit(query, client="b")
+    worker.submit(query)
+    worker.cancel(first)
+    worker.submit(query, client="a")
 
 
 def test_stopping_refuses_what_waits(worker: PredictionWorker, made: list[Echo], query: GraspQuery) -> None:

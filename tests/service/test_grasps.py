@@ -5,14 +5,19 @@ from __future__ import annotations
 import concurrent.futures
 import gc
 import logging
+import threading
+import tracemalloc
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx
+import numpy as np
 import pytest
 
+from service import payloads
+from service.grasps import SMALL_BODY
 from tests.conftest import PATIENCE_S
-from tests.service.wire import POINTS, post, post_head
+from tests.service.wire import OCTETS, POINTS, connect, post, post_head
 
 Serve = Callable[..., Any]
 Eventually = Callable[[Callable[[], bool]], None]
@@ -170,3 +175,115 @@ def test_a_fault_of_the_predictor_is_a_500_that_tells_no_details_and_the_next_re
     assert "secret" not in answer.text
     server.predictor.fault = None
     assert post(server.url).status_code == 200
+
+
+def test_what_waits_holds_its_cloud_and_not_its_body(
+    serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, eventually: Eventually
+) -> None:
+    server = serve()
+    body = b'{"points": [[0, 0, 1], [0, 0.1, 1]]' + b" " * 4_000_000 + b"}"
+    json = {"Content-Type": "application/json"}
+    tracemalloc.start()
+    try:
+        asked = [pool.submit(httpx.post, f"{server.url}/grasps", content=body, headers=json) for _ in range(6)]
+        eventually(lambda: "grasp_queue_depth 5.0" in httpx.get(f"{server.url}/metrics").text)
+        assert server.memory.held == 6 * 24
+        in_service = tracemalloc.take_snapshot().filter_traces([tracemalloc.Filter(True, "*/service/intake.py")])
+        assert sum(trace.size for trace in in_service.traces) < 4_000_000
+    finally:
+        tracemalloc.stop()
+    server.predictor.gate.set()
+    assert [answer.result().status_code for answer in asked] == [200] * 6
+    eventually(lambda: server.memory.held == 0)
+
+
+def test_clouds_that_wait_are_limited_together_whatever_their_bodies_were(
+    serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, eventually: Eventually
+) -> None:
+    server = serve(max_held_mb=0.25)
+    cloud = np.zeros((10_000, 3), np.float32).tobytes()
+    asked = [
+        pool.submit(httpx.post, f"{server.url}/grasps", content=cloud, headers=OCTETS, timeout=PATIENCE_S)
+        for _ in range(8)
+    ]
+    eventually(lambda: sum(answer.done() for answer in asked) == 6)
+    assert server.memory.held == 2 * len(cloud)
+    server.predictor.gate.set()
+    assert sorted(answer.result().status_code for answer in asked) == [200] * 2 + [429] * 6
+
+
+def test_a_small_body_is_decoded_beside_large_ones(
+    serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """The large bodies are held in their decoder, so nothing here depends on how long they take."""
+    server = serve()
+    server.predictor.gate.set()
+    gate, entered = threading.Event(), threading.Semaphore(0)
+    decode = payloads._DECODERS["application/octet-stream"]
+
+    def held(body: bytearray, max_points: int) -> payloads.Payload:
+        if len(body) > SMALL_BODY:
+            entered.release()
+            assert gate.wait(PATIENCE_S)
+        return decode(body, max_points)
+
+    monkeypatch.setitem(payloads._DECODERS, "application/octet-stream", held)  # type: ignore[arg-type]
+    large = np.zeros((100_000, 3), np.float32).tobytes()
+    asked = [
+        pool.submit(httpx.post, f"{server.url}/grasps", content=large, headers=OCTETS, timeout=PATIENCE_S)
+        for _ in range(3)
+    ]
+    assert entered.acquire(timeout=PATIENCE_S)
+    assert post(server.url).status_code == 200
+    gate.set()
+    assert [answer.result().status_code for answer in asked] == [200] * 3
+
+
+def test_a_prediction_whose_client_has_gone_or_whose_deadline_passed_is_given_up(
+    serve: Serve, eventually: Eventually
+) -> None:
+    server = serve()
+    with post_head(server.url, "/grasps?seed=1") as connection:
+        connection.sendall(POINTS)
+        assert server.predictor.entered.acquire(timeout=PATIENCE_S)
+    eventually(lambda: 'status="499"} 1.0' in httpx.get(f"{server.url}/metrics").text)
+    server.predictor.gate.set()
+    eventually(lambda: server.predictor.given_up == [1])
+    server.predictor.gate.clear()
+    assert post(server.url, seed=2, X_Request_Timeout="0.2").status_code == 504
+    server.predictor.gate.set()
+    eventually(lambda: server.predictor.given_up == [1, 2])
+
+
+def test_one_key_cannot_take_all_places(
+    serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, eventually: Eventually
+) -> None:
+    server = serve(queue_size=4, api_keys="one,other", client_places=2)
+    running = pool.submit(post, server.url, X_API_Key="one")
+    assert server.predictor.entered.acquire(timeout=PATIENCE_S)
+    waiting = [pool.submit(post, server.url, X_API_Key="one") for _ in range(2)]
+    eventually(lambda: server.endpoint._worker.depth == 2)
+    refused = post(server.url, X_API_Key="one")
+    assert (refused.status_code, "of yours" in refused.json()["detail"]) == (429, True)
+    other = pool.submit(post, server.url, X_API_Key="other")
+    eventually(lambda: server.endpoint._worker.depth == 3)
+    server.predictor.gate.set()
+    assert [answer.result().status_code for answer in (running, *waiting, other)] == [200] * 4
+
+
+def test_a_lone_client_is_never_told_that_the_queue_is_full(serve: Serve) -> None:
+    """One request after the other on one connection, some of them sent before the answer to the last one came."""
+    server = serve(queue_size=1)
+    server.predictor.gate.set()
+    request = (
+        b"POST /grasps HTTP/1.1\r\nHost: test\r\nContent-Type: application/octet-stream\r\n"
+        b"X-Request-Timeout: 5\r\nContent-Length: %d\r\n\r\n" % len(POINTS)
+    ) + POINTS
+    with connect(server.url) as connection:
+        received = b""
+        for burst in (1, 1, 1, 20, 1, 20):
+            connection.sendall(request * burst)
+            wanted = received.count(b"HTTP/1.1 ") + burst
+            while received.count(b"HTTP/1.1 ") < wanted or not received.endswith(b"}"):
+                received += connection.recv(65_536)
+    assert received.count(b"HTTP/1.1 200 ") == received.count(b"HTTP/1.1 ")

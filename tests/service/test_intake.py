@@ -18,7 +18,7 @@ Eventually = Callable[[Callable[[], bool]], None]
 
 
 def test_too_many_bytes_at_once_are_a_429_and_are_forgotten(serve: Serve, eventually: Eventually) -> None:
-    server = serve(max_body_mb=1.0)
+    server = serve(max_body_mb=1.0, max_held_mb=4.0)
     server.predictor.gate.set()
     uploads = [post_head(server.url, length=2**20) for _ in range(5)]
     for upload in uploads:
@@ -28,6 +28,7 @@ def test_too_many_bytes_at_once_are_a_429_and_are_forgotten(serve: Serve, eventu
     for upload in uploads:
         upload.close()
     eventually(lambda: server.endpoint.active == 0)
+    assert server.memory.held == 0
     assert post(server.url).status_code == 200
 
 

@@ -1,0 +1,122 @@
+"""The order in which those are served that wait, as a value: no threads, and time stands still."""
+
+from __future__ import annotations
+
+import math
+
+import numpy as np
+import pytest
+from hypothesis import given
+from hypothesis import strategies as st
+
+from service.turns import Job, Turns
+from tesnet.query import GraspQuery
+
+QUERY = GraspQuery(np.zeros((4, 3), np.float32))
+seconds = st.floats(0.001, 60)
+
+
+def job(expected: float, deadline: float = math.inf, client: str | None = None) -> Job:
+    return Job(QUERY, expected, deadline, client=client, submitted=0.0)
+
+
+def test_the_cheapest_goes_first_and_equals_in_order_of_arrival() -> None:
+    turns = Turns(places=8)
+    dear, first, second = job(8.0), job(1.0), job(1.1)
+    for one in (dear, first, second):
+        turns.add(one, busy=0.0)
+    assert [turns.take() for _ in range(4)] == [first, second, dear, None]
+
+
+def test_whoever_is_passed_for_as_long_as_it_would_have_taken_is_due() -> None:
+    turns = Turns(places=8)
+    dear = job(8.0)
+    turns.add(dear, busy=2.0)
+    passed = 0
+    while True:
+        turns.add(job(1.0), busy=0.0)
+        taken = turns.take()
+        if taken is dear:
+            break
+        passed += 1
+    assert passed == 10  # 2 s that it would have waited, and 8 s of its own
+
+
+def test_a_deadline_leaves_less_to_spare() -> None:
+    turns = Turns(places=8)
+    dear = job(8.0, deadline=13.0)
+    turns.add(dear, busy=2.0)
+    for _ in range(3):
+        turns.add(job(1.0), busy=0.0)
+        assert turns.take() is not dear
+    turns.add(job(1.0), busy=0.0)
+    assert turns.take() is dear
+
+
+@given(st.lists(st.tuples(st.booleans(), seconds), max_size=60))
+def test_nobody_waits_much_more_than_twice_as_long_as_in_order_of_arrival(events: list[tuple[bool, float]]) -> None:
+    turns = Turns(places=100)
+    clock = 0.0
+    in_order: dict[Job, float] = {}
+    longest = max((expected for _, expected in events), default=0.0)
+
+    def serve() -> None:
+        nonlocal clock
+        taken = turns.take()
+        assert taken is not None
+        assert clock <= 2 * (in_order[taken] + taken.expected) + longest + 1e-6
+        clock += taken.expected
+
+    for served, expected in events:
+        if served and len(turns):
+            serve()
+        one = Job(QUERY, expected, submitted=clock)
+        in_order[one] = clock + turns.expected
+        turns.add(one, busy=0.0)
+    while len(turns):
+        serve()
+
+
+def test_a_cheap_one_may_interrupt_a_dear_one_while_nobody_is_due() -> None:
+    turns = Turns(places=8)
+    running = job(8.0)
+    turns.add(running, busy=0.0)
+    assert turns.take() is running
+    turns.add(job(4.0), busy=8.0)
+    assert turns.take_between(running) is None
+    for _ in range(8):
+        cheap = job(1.0)
+        turns.add(cheap, busy=8.0)
+        assert turns.take_between(running) is cheap
+    turns.add(job(1.0), busy=8.0)
+    assert turns.take_between(running) is None  # the one that runs is due
+
+
+def test_cheap_ones_have_spare_places_and_others_do_not() -> None:
+    turns = Turns(places=4)
+    for _ in range(4):
+        assert turns.has_place(job(1.0))
+        turns.add(job(1.0), busy=0.0)
+    assert not turns.has_place(job(1.0))
+    assert turns.has_place(job(0.1))
+    turns.add(job(0.1), busy=0.0)
+    assert len(turns) == turns.most == 5
+    assert not turns.has_place(job(0.1))
+
+
+def test_places_are_counted_by_client() -> None:
+    turns = Turns(places=8, client_places=2)
+    jobs = [job(1.0, client="a"), job(1.0, client="a"), job(1.0)]
+    for one in jobs:
+        turns.add(one, busy=0.0)
+    assert (turns.is_full_for("a"), turns.is_full_for("b"), turns.is_full_for(None)) == (True, False, False)
+    turns.remove(jobs[0])
+    turns.remove(jobs[0])
+    assert not turns.is_full_for("a")
+    turns.clear()
+    assert not any(turns.is_full_for(client) for client in ("a", None))
+
+
+@pytest.mark.parametrize("expected", [1e-6, 0.1, 1.0, 100.0])
+def test_twice_as_long_is_one_size_more(expected: float) -> None:
+    assert job(2 * expected).size == job(expected).size + 1
