@@ -19,6 +19,7 @@ import torch
 
 from simharness.sim.camera import observe
 from simharness.sim.objects import load_object_set
+from simharness.sim.protocol import query_about
 from simharness.sim.scene import make_scene
 from simharness.sim.world import World
 from tesnet import networks, weights
@@ -26,7 +27,6 @@ from tesnet.predictor import GraspPredictor
 from tesnet.query import GraspQuery
 from training.curves import Panel, draw
 from training.evaluate import validate
-from training.generate import observed_query
 from training.views import LabelsError, load_views
 
 PUBLISHED: Mapping[str, tuple[float, float]] = {
@@ -205,7 +205,7 @@ def clouds(count: int) -> list[GraspQuery]:
         rng = np.random.default_rng([6, number])
         with World() as world:
             make_scene(world, kind, load_object_set("procedural", kind), rng)  # type: ignore[arg-type]  # a literal
-            queries.append(observed_query(observe(world, "random", rng)))
+            queries.append(query_about(observe(world, "random", rng)))
     return queries
 
 
