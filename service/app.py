@@ -28,7 +28,7 @@ from service.payloads import CONTENT_TYPES
 from service.settings import Settings, service_version
 from service.viewer import viewer
 from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
-from tesnet.geometry import FRAME_CONVENTIONS, HAND_TO_TCP, PANDA, Gripper
+from tesnet.geometry import FRAME_CONVENTIONS, PANDA, Gripper
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
 
 DESCRIPTION = """Point cloud in, ranked SE(3) grasps out. Lengths are metres; poses are in the frame of the request's
@@ -188,7 +188,7 @@ def _gripper(hand: Gripper) -> schemas.GripperOut:
         finger_depth=hand.finger_depth,
         finger_thickness=hand.finger_thickness,
         finger_breadth=hand.finger_breadth,
-        hand_to_tcp=HAND_TO_TCP,
+        hand_to_tcp=PANDA.hand_to_tcp,
         parts=[
             schemas.PartOut(
                 name=part.name,

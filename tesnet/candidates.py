@@ -92,8 +92,7 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
         allowed = allowed[cloud.on_target]
     if len(allowed) == 0:
         return _no_candidates(cloud), {}
-    narrower = (PANDA.max_width - query.gripper.max_width) / 2
-    config = replace(config, max_offset=config.max_offset - narrower)
+    config = limits_for(query.gripper, config)
     generator = torch.Generator().manual_seed(query.seed)
     start = int(torch.randint(len(allowed), (1,), generator=generator))
     count = query.num_approach_points
@@ -104,7 +103,7 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
             break
         count = more_approach_points(count)
     if not bool(alive.any()) and cloud.up is not None and cloud.support_height is not None:
-        candidates = _straight_down(cloud, cloud.up, config, approach_points)
+        candidates = _straight_down(cloud, cloud.up, query.gripper, config, approach_points)
         alive, _ = _judge(cloud, query, config, candidates)
     survivors = alive.nonzero()[:, 0]
     if len(survivors) > query.max_candidates:
@@ -118,6 +117,18 @@ def more_approach_points(count: int) -> int:
     return min(4 * count, MAX_APPROACH_POINTS)
 
 
+def limits_for(hand: Gripper, config: CandidateConfig) -> CandidateConfig:
+    """The limits, which are the Panda hand's, for another one: they follow its opening and the depth of its fingers."""
+    wider = (hand.max_width - PANDA.max_width) / 2
+    deeper = hand.finger_depth - PANDA.finger_depth
+    return replace(
+        config,
+        max_offset=config.max_offset + wider,
+        max_depth=config.max_depth + deeper,
+        max_pair_distance=config.max_pair_distance + max(0.0, wider, deeper),
+    )
+
+
 def _no_candidates(cloud: PreparedCloud) -> Candidates:
     nothing = torch.empty(0, dtype=torch.long, device=cloud.points.device)
     return Candidates(nothing, nothing, cloud.points.new_empty(0, 4, 4))
@@ -129,7 +140,7 @@ def _search(
     """The pairs in reach of the approach points, a mask of those that no rule drops, and how many each rule does."""
     normals = contact_normals(cloud, config)
     approach, contact = pairs_in_reach(cloud.points, normals, approach_points, config)
-    poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact])
+    poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact], hand=query.gripper)
     candidates = Candidates(approach, contact, poses)
     return candidates, *_judge(cloud, query, config, candidates)
 
@@ -153,7 +164,9 @@ def _judge(
     return alive, rejected
 
 
-def _straight_down(cloud: PreparedCloud, up: Tensor, config: CandidateConfig, approach_points: Tensor) -> Candidates:
+def _straight_down(
+    cloud: PreparedCloud, up: Tensor, hand: Gripper, config: CandidateConfig, approach_points: Tensor
+) -> Candidates:
     """Pairs less deep than `min_depth`, for a hand that travels against `up` and closes along the levelled normal.
 
     So shallow a pair says nothing of the direction of travel, but of flat things that lie on a plane it is known.
@@ -180,7 +193,7 @@ def _straight_down(cloud: PreparedCloud, up: Tensor, config: CandidateConfig, ap
         found.append((some[which], contacts[contact]))
     approach, contact = (torch.cat(parts) for parts in zip(*found, strict=True))
     down = (-up).expand(len(approach), 3)
-    poses = poses_along(cloud.points[approach], cloud.points[contact], level[contact], down)
+    poses = poses_along(cloud.points[approach], cloud.points[contact], level[contact], down, hand=hand)
     return Candidates(approach, contact, poses)
 
 
@@ -262,33 +275,47 @@ def _pairs_of_some(
     return approach_points[which], contact
 
 
-def grasp_poses(approach_points: Tensor, contact_points: Tensor, contact_normals: Tensor) -> Tensor:
-    """TCP poses (C, 4, 4) of pairs of points (C, 3) and the contact points' unit normals (C, 3).
+def grasp_poses(
+    approach_points: Tensor, contact_points: Tensor, contact_normals: Tensor, *, hand: Gripper = PANDA
+) -> Tensor:
+    """TCP poses (C, 4, 4) of the open hand for pairs of points (C, 3) and the contact points' unit normals (C, 3).
 
     z = d_perp / |d_perp| with d_perp the part of d = p_c - p_a across the normal; y = the normal; the fingertips stop
-    7 mm past the depth of the contact point on the line through p_a (CONVENTIONS.md, "From two points to a grasp").
+    7 mm past the depth of the contact point on the line through p_a (CONVENTIONS.md, "From two points to a grasp"), once
+    they have closed up to it.
     """
     d = contact_points - approach_points
-    d_perp = d - (d * contact_normals).sum(dim=1, keepdim=True) * contact_normals
+    along = (d * contact_normals).sum(dim=1, keepdim=True)
+    d_perp = d - along * contact_normals
     depth = d_perp.norm(dim=1, keepdim=True)
     z = d_perp / depth
     y = contact_normals - (contact_normals * z).sum(dim=1, keepdim=True) * z
-    return _poses(approach_points, z, y / y.norm(dim=1, keepdim=True), depth)
+    return _poses(approach_points, z, y / y.norm(dim=1, keepdim=True), depth, along, hand)
 
 
-def poses_along(approach_points: Tensor, contact_points: Tensor, closing: Tensor, travel: Tensor) -> Tensor:
+def poses_along(
+    approach_points: Tensor, contact_points: Tensor, closing: Tensor, travel: Tensor, *, hand: Gripper = PANDA
+) -> Tensor:
     """TCP poses (C, 4, 4) of pairs of points (C, 3) whose unit directions of closing and travel (C, 3) are known.
 
     Those of `grasp_poses` where the directions are; depth is measured along the travel.
     """
-    depth = ((contact_points - approach_points) * travel).sum(dim=1, keepdim=True)
-    return _poses(approach_points, travel, closing, depth)
+    d = contact_points - approach_points
+    along, depth = ((d * direction).sum(dim=1, keepdim=True) for direction in (closing, travel))
+    return _poses(approach_points, travel, closing, depth, along, hand)
 
 
-def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor) -> Tensor:
-    """TCP poses (C, 4, 4) of hands whose tips stop 7 mm past the depth (C, 1) under the approach points."""
+def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor, along: Tensor, hand: Gripper) -> Tensor:
+    """TCP poses (C, 4, 4) of open hands whose tips come to lie 7 mm past the depth (C, 1) under the approach points.
+
+    Of a hand whose tips swing forward that is once they have closed up to the contact points, `along` (C, 1) beside the
+    middle.
+    """
     x = torch.linalg.cross(y, z, dim=1)
-    tcp = approach_points + (depth + TIP_BEYOND_CONTACT - PANDA.tip_offset) * z
+    reach = depth + TIP_BEYOND_CONTACT - hand.tip_offset
+    if hand.linkage_length is not None:
+        reach = reach - (hand.tcp_at(2 * along.clamp(0.0, hand.max_width / 2)) - hand.hand_to_tcp)
+    tcp = approach_points + reach * z
     poses = torch.zeros(len(z), 4, 4, dtype=z.dtype, device=z.device)
     poses[:, :3, :] = torch.stack([x, y, z, tcp], dim=2)
     poses[:, 3, 3] = 1
@@ -296,11 +323,11 @@ def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor) -> Tens
 
 
 def hand_clearance(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Tensor:
-    """(C,) metres between the support plane and the lowest corner of the open hand; infinite without a plane."""
+    """(C,) metres from the support plane to the lowest corner of the hand, open or closing; infinite without one."""
     if cloud.up is None or cloud.support_height is None:
         return torch.full((len(Ts_canonical_grasp),), math.inf, device=Ts_canonical_grasp.device)
     corners = torch.tensor(
-        gripper.corners(gripper.max_width), dtype=Ts_canonical_grasp.dtype, device=Ts_canonical_grasp.device
+        gripper.closing_corners(gripper.max_width), dtype=Ts_canonical_grasp.dtype, device=Ts_canonical_grasp.device
     )
     up_in_grasp = (Ts_canonical_grasp[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
     tcp_height = Ts_canonical_grasp[:, :3, 3] @ cloud.up - cloud.support_height

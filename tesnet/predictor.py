@@ -13,7 +13,7 @@ import torch
 
 from tesnet import candidates, cloud, collision, networks, ranking, support, weights
 from tesnet.errors import DeviceError, GaveUp, WeightsError
-from tesnet.geometry import PANDA, Box, GraspSet
+from tesnet.geometry import PANDA, Box, GraspSet, Gripper
 from tesnet.networks import Network
 from tesnet.query import MAX_SEED, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
@@ -235,7 +235,7 @@ class GraspPredictor:
         )
         last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
         rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
-        grasps = _grasps(prepared, found.free, scores, ranked.indices, query.gripper.max_width)
+        grasps = _grasps(prepared, found.free, scores, ranked.indices, query.gripper)
         clock.lap("rank")
         return GraspResult(
             grasps=grasps,
@@ -428,7 +428,7 @@ def _nothing(
     clock: _Clock,
 ) -> GraspResult:
     counts = GraspCounts(len(query.points), *sizes, 0, rejected)
-    return GraspResult(GraspSet.empty(), counts, reason, tuple(notes), clock.laps_ms)
+    return GraspResult(GraspSet.empty(query.gripper), counts, reason, tuple(notes), clock.laps_ms)
 
 
 def _grasps(
@@ -436,15 +436,16 @@ def _grasps(
     free: candidates.Candidates,
     scores: torch.Tensor,
     indices: torch.Tensor,
-    width: float,
+    hand: Gripper,
 ) -> GraspSet:
-    """The candidates at the indices (M,), back in the frame of the query, for a hand opened to `width`."""
+    """The candidates at the indices (M,), back in the frame of the query, for an open hand."""
     chosen = free.select(indices.to(scores.device))
     to_cloud = prepared.T_cloud_canonical
     return GraspSet(
         scores=scores[indices.to(scores.device)].cpu().double().numpy(),
         Ts_cloud_grasp=to_cloud.matrix @ chosen.Ts_canonical_grasp.cpu().double().numpy(),
-        widths=np.full(len(indices), width),
+        widths=np.full(len(indices), hand.max_width),
         approach_points=to_cloud.apply(prepared.points[chosen.approach].cpu().numpy()),
         contact_points=to_cloud.apply(prepared.points[chosen.contact].cpu().numpy()),
+        gripper=hand,
     )

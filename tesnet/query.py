@@ -13,7 +13,7 @@ import numpy as np
 from numpy.typing import ArrayLike, NDArray
 
 from tesnet.errors import InvalidQuery
-from tesnet.geometry import PANDA, Box, Gripper
+from tesnet.geometry import PANDA, WIDEST, Box, Gripper
 
 MAX_GRASPS = 1000
 MAX_APPROACH_POINTS = 1024
@@ -45,7 +45,7 @@ class GraspQuery:
         max_grasps, min_score: how many to return, and the least score.
         separation_translation, separation_rotation_deg: grasps nearer than both to a better one are dropped.
         num_approach_points, max_candidates: search effort.
-        gripper: the hand, which opens no wider than the one that the networks were trained with.
+        gripper: the hand, which opens no wider than `WIDEST`.
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
         seed: makes sampling repeatable.
 
@@ -95,11 +95,7 @@ class GraspQuery:
                 object.__setattr__(self, "support_height", float(self.support_height))
         if self.target is not None and not isinstance(self.target, Box):
             object.__setattr__(self, "target", _mask(self.target, len(self.points)))
-        if not isinstance(self.gripper, Gripper):
-            raise InvalidQuery("gripper", f"is of type {type(self.gripper).__name__}; give a Gripper")
-        _in_range(
-            "gripper", self.gripper.max_width, 0, PANDA.max_width, " m in max_width: no network knows a wider hand"
-        )
+        _check_gripper(self.gripper)
         for name, kind in (("workspace", Box), ("approach", ApproachCone)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
@@ -137,6 +133,16 @@ def box_option(name: str, minimum: ArrayLike, maximum: ArrayLike) -> Box:
         return Box(np.asarray(minimum), np.asarray(maximum))
     except ValueError as error:
         raise InvalidQuery(name, str(error)) from None
+
+
+def _check_gripper(gripper: Any) -> None:
+    if not isinstance(gripper, Gripper):
+        raise InvalidQuery("gripper", f"is of type {type(gripper).__name__}; give a Gripper")
+    if gripper.max_width > WIDEST:
+        raise InvalidQuery(
+            "gripper",
+            f"opens {gripper.max_width:g} m (limit {WIDEST:g} m); give a max_width up to it, and open no wider",
+        )
 
 
 def _cloud(points: ArrayLike) -> NDArray[np.float32]:

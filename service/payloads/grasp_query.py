@@ -69,6 +69,6 @@ def _of_points(mask: NDArray[np.bool_], payload: Payload) -> NDArray[np.bool_]:
 
 def _gripper(size: GripperSize) -> Gripper:
     try:
-        return Gripper.like_panda(size.model_dump(exclude_unset=True))
+        return PANDA.with_sizes(size.model_dump(exclude_unset=True))
     except ValueError as error:
         raise Invalid("gripper", str(error)) from None

@@ -16,7 +16,7 @@ from jaxtyping import Float64
 from numpy.typing import ArrayLike
 
 from simharness.sim.world import BASE_LINK, World, data_path
-from tesnet.geometry import HAND_TO_TCP, PANDA, Pose, quaternions_xyzw
+from tesnet.geometry import PANDA, Pose, quaternions_xyzw
 
 MAX_WIDTH = PANDA.max_width
 FINGER_BASE = 0.0584
@@ -112,7 +112,9 @@ def placements(Ts_world_grasp: Float64[np.ndarray, "grasps 4 4"], widths: Sequen
     """TCP poses and openings (metres) as placements of the hand."""
     rotations, tcps = Ts_world_grasp[:, :3, :3], Ts_world_grasp[:, :3, 3]
     z = rotations[:, :, 2]
-    rows = zip((tcps - HAND_TO_TCP * z).tolist(), quaternions_xyzw(rotations).tolist(), z.tolist(), widths, strict=True)
+    rows = zip(
+        (tcps - PANDA.hand_to_tcp * z).tolist(), quaternions_xyzw(rotations).tolist(), z.tolist(), widths, strict=True
+    )
     return [
         Placement(tuple(position), tuple(quaternion_xyzw), tuple(axis), float(width))
         for position, quaternion_xyzw, axis, width in rows
@@ -190,7 +192,7 @@ class Hand:
     @property
     def T_world_grasp(self) -> Pose:
         """Where the TCP is."""
-        return self._world.pose(self.body) @ Pose(np.eye(3), np.array([0.0, 0.0, HAND_TO_TCP]))
+        return self._world.pose(self.body) @ Pose(np.eye(3), np.array([0.0, 0.0, PANDA.hand_to_tcp]))
 
     @property
     def width(self) -> float:

@@ -1,20 +1,26 @@
-"""The parallel gripper: its sizes, and the parts that follow from them."""
+"""A two-finger hand: its sizes, and the parts that follow from them. Knows no hand by name but the Panda's."""
 
 from __future__ import annotations
 
+import math
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, field, fields, replace
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
 
 from tesnet.geometry.part import Extent, Part
+from tesnet.geometry.pose import Pose
 
-HAND_TO_TCP = 0.1034
-"""Metres from the origin of `panda_hand` to the TCP, along z."""
+WIDEST = 0.16
+"""Metres: the largest opening of any hand that is served."""
 
 PALM_OVERLAP = 0.004
 """Metres of the usable finger depth that the hand's body covers."""
+
+_CLOSING_STEPS = 8
+"""Into so many pieces the arc of a fingertip is cut, which is then at most 0.3 mm off."""
 
 _TAPERED = {
     "finger_thickness": "finger_tip_thickness",
@@ -23,14 +29,21 @@ _TAPERED = {
 }
 """Each size of a part, and the size of its narrower end."""
 
+_OF_EITHER_SIGN = ("hand_yaw", "linkage_offset")
+
 
 @dataclass(frozen=True, slots=True)
 class Gripper:
-    """A two-finger parallel hand, metres, in its grasp frame.
+    """A two-finger hand with parallel pads, metres, in its grasp frame.
 
     The frame's origin is the TCP, midway between the finger pads; +z is the direction of travel, +y the closing
     direction. Fingers are prisms whose outer face tapers towards the tip; the palm is a box whose sides taper towards
     the fingers. Defaults are the Franka hand's, measured on the convex hulls of its published collision meshes.
+
+    Fingers slide along y, or swing on parallel cranks: then their tips also move along z as they close. From the base
+    link they are at A + sqrt(L^2 - (w / 2 - B)^2) with the opening w, the cranks' length L and B, how far their pivots
+    stand outside of where the pads are on the middle line. The grasp frame moves with the tips, so in it the palm
+    moves; `palm_depth` is such that the part covers the palm at every opening.
 
     Args:
         max_width: largest opening between the pads.
@@ -42,9 +55,15 @@ class Gripper:
         palm_depth, palm_length: extents of the hand's body along z and y.
         palm_breadth, palm_front_breadth: its extent along x, largest and at the fingers.
         palm_taper: length of its taper, measured back from the fingers.
+        hand_to_tcp: distance along z from the origin of the hand's base link to the TCP of the open hand.
+        hand_yaw: angle about z from the grasp frame's axes to the base link's, radians.
+        linkage_length: L; None where the fingers slide.
+        linkage_offset: B.
+        name: of a known hand, or None; it makes no difference to equality.
 
     Raises:
-        ValueError: a length that is not positive, an end broader than its part, fingers too short for the TCP.
+        ValueError: a length that is not positive, an end broader than its part, fingers too short for the TCP, cranks
+            that do not reach the opening.
     """
 
     max_width: float = 0.08
@@ -60,11 +79,16 @@ class Gripper:
     palm_breadth: float = 0.063
     palm_front_breadth: float = 0.0315
     palm_taper: float = 0.0625
+    hand_to_tcp: float = 0.1034
+    hand_yaw: float = 0.0
+    linkage_length: float | None = None
+    linkage_offset: float = 0.0
+    name: str | None = field(default=None, compare=False)
 
     def __post_init__(self) -> None:
-        for name in self.__slots__:
-            if not getattr(self, name) > 0:
-                raise ValueError(f"{name} is {getattr(self, name)}; a gripper's lengths are positive, in metres")
+        for name, value in self.sizes().items():
+            if name not in _OF_EITHER_SIGN and not value > 0:
+                raise ValueError(f"{name} is {value}; a gripper's lengths are positive, in metres")
         for whole, end in _TAPERED.items():
             if getattr(self, end) > getattr(self, whole):
                 raise ValueError(
@@ -76,12 +100,18 @@ class Gripper:
                 f"finger_depth is {self.finger_depth}; it must exceed {self.tip_offset + PALM_OVERLAP:g} m, or the "
                 "palm would lie between the pads"
             )
+        if self.linkage_length is not None:
+            reach = max(abs(self.max_width / 2 - self.linkage_offset), abs(self.linkage_offset))
+            if not reach < self.linkage_length:
+                raise ValueError(
+                    f"linkage_length is {self.linkage_length}; it must exceed {reach:g} m, how far the pads swing to "
+                    "a side with this max_width and linkage_offset"
+                )
 
     # Factories
 
-    @classmethod
-    def like_panda(cls, lengths: Mapping[str, float]) -> Gripper:
-        """A hand that differs from the Panda's in the lengths given, by their names.
+    def with_sizes(self, sizes: Mapping[str, float]) -> Gripper:
+        """A hand that differs from this one in the sizes given, by their names; it has no name.
 
         A part whose size is given is straight, unless its tapered end is given as well; a taper that would be longer
         than its part is cut.
@@ -89,16 +119,26 @@ class Gripper:
         Raises:
             ValueError: as for any `Gripper`.
         """
-        given = dict(lengths)
+        given: dict[str, Any] = dict(sizes)
         for whole, end in _TAPERED.items():
             if whole in given:
                 given.setdefault(end, given[whole])
-        hand = cls(**given)
-        given["finger_taper"] = min(hand.finger_taper, hand.finger_length)
-        given["palm_taper"] = min(hand.palm_taper, hand.palm_depth)
-        return cls(**given)
+        hand = replace(self, **given, name=None)
+        return replace(
+            hand,
+            finger_taper=min(hand.finger_taper, hand.finger_length),
+            palm_taper=min(hand.palm_taper, hand.palm_depth),
+        )
 
     # Accessors
+
+    def sizes(self) -> dict[str, float]:
+        """The hand's sizes by their names; `linkage_length` and `linkage_offset` only where it has cranks."""
+        return {
+            item.name: getattr(self, item.name)
+            for item in fields(self)
+            if item.name not in (("name",) if self.linkage_length else ("name", "linkage_length", "linkage_offset"))
+        }
 
     @property
     def finger_length(self) -> float:
@@ -129,7 +169,42 @@ class Gripper:
             ),
         )
 
+    @property
+    def travel(self) -> float:
+        """Metres by which the tips advance along z at most as the open hand closes."""
+        return float(max(self.tcp_at(width) for width in self.closing(self.max_width)) - self.hand_to_tcp)
+
     # Operations
+
+    def tcp_at(self, width: Any) -> Any:
+        """Metres from the origin of the hand's base link to the TCP, along z, as the hand is open by `width`.
+
+        Args:
+            width: a number, or an array or tensor of them.
+        """
+        if self.linkage_length is None:
+            return self.hand_to_tcp
+        return self.hand_to_tcp + self._rise(width) - self._rise(self.max_width)
+
+    def _rise(self, width: Any) -> Any:
+        assert self.linkage_length is not None
+        return (self.linkage_length**2 - (width / 2 - self.linkage_offset) ** 2) ** 0.5
+
+    def closing(self, width: float) -> list[float]:
+        """Openings on the way from `width` to closed at which the tips are taken to be, one after the other.
+
+        Where they slide there is one, as they advance no farther; where they swing, that of the farthest is among them.
+        """
+        if self.linkage_length is None:
+            return [width]
+        highest = min(max(2 * self.linkage_offset, 0.0), width)
+        return sorted({highest, *(width * step / _CLOSING_STEPS for step in range(_CLOSING_STEPS + 1))}, reverse=True)
+
+    def T_grasp_hand(self, width: float) -> Pose:
+        """Pose of the hand's base link in the grasp frame of the hand open by `width`."""
+        cosine, sine = math.cos(self.hand_yaw), math.sin(self.hand_yaw)
+        rotation = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+        return Pose(rotation, np.array([0.0, 0.0, -self.tcp_at(width)]))
 
     def corners(self, width: float) -> NDArray[np.float64]:
         """Extreme points (K, 3) of the hand in the grasp frame; their convex hull contains each finger and the palm.
@@ -139,5 +214,13 @@ class Gripper:
         """
         return np.concatenate([part.corners(width) for part in self.parts])
 
+    def closing_corners(self, width: float) -> NDArray[np.float64]:
+        """`corners`, and those of the fingers on their way from `width` to closed, while the base link stands still."""
+        shifts = [(width, 0.0), *((w, self.tcp_at(w) - self.tcp_at(width)) for w in self.closing(width) if w != width)]
+        fingers = [
+            part.corners(w) + np.array([0.0, 0.0, shift]) for w, shift in shifts for part in self.parts if part.side
+        ]
+        return np.concatenate([*fingers, *(part.corners(width) for part in self.parts if not part.side)])
 
-PANDA = Gripper()
+
+PANDA = Gripper(name="franka")

@@ -12,7 +12,7 @@ import pytest
 from numpy.typing import NDArray
 
 from service.schemas import GraspOptions, GraspResponse
-from tesnet.geometry import HAND_TO_TCP, Pose
+from tesnet.geometry import PANDA, Pose
 from tesnet.result import REJECTIONS
 from tests.service.wire import npy, post_octets, url_options
 
@@ -97,7 +97,7 @@ def test_hand_pose_and_pregrasp_lie_behind_the_grasp(http: httpx.Client, cloud: 
         pose = Pose.from_quaternion(np.array(grasp["quaternion_xyzw"]), np.array(grasp["position"]))
         np.testing.assert_allclose(pose.matrix, matrix, atol=1e-6)
         back = np.array([0, 0, -1.0])
-        np.testing.assert_allclose(grasp["hand_pose"]["position"], pose.apply(HAND_TO_TCP * back), atol=1e-6)
+        np.testing.assert_allclose(grasp["hand_pose"]["position"], pose.apply(PANDA.hand_to_tcp * back), atol=1e-6)
         np.testing.assert_allclose(grasp["pregrasp"]["position"], pose.apply(0.08 * back), atol=1e-6)
         assert grasp["pregrasp"]["quaternion_xyzw"] == grasp["quaternion_xyzw"]
 

@@ -116,7 +116,7 @@ def test_the_hand_s_own_size_decides_width_and_collision() -> None:
     predictor = fresh_predictor()
     options: dict[str, Any] = {"max_candidates": 300, "max_grasps": 1000}
     panda = predictor.predict(tabletop_query(**options))
-    narrow = predictor.predict(tabletop_query(gripper=Gripper.like_panda({"max_width": 0.05}), **options))
+    narrow = predictor.predict(tabletop_query(gripper=PANDA.with_sizes({"max_width": 0.05}), **options))
     assert set(panda.grasps.widths) == {0.08}
     assert set(narrow.grasps.widths) == {0.05}
     assert any("gripper" in note for note in narrow.warnings)
@@ -128,7 +128,7 @@ def test_thinner_fingers_collide_less() -> None:
     query = tabletop_query(max_candidates=500)
     ready = prepared(query)
     poses = candidates.generate(ready, query, candidates.CandidateConfig())[0].Ts_canonical_grasp
-    thin = Gripper.like_panda({"finger_thickness": 0.006, "finger_breadth": 0.01})
+    thin = PANDA.with_sizes({"finger_thickness": 0.006, "finger_breadth": 0.01})
     slim, panda = (collision.in_collision(ready.points, poses, hand, 0.08, 0.05) for hand in (thin, PANDA))
     assert not bool((slim & ~panda).any())
     assert int(slim.sum()) < int(panda.sum())
@@ -137,8 +137,8 @@ def test_thinner_fingers_collide_less() -> None:
 def test_a_larger_palm_comes_nearer_to_the_support() -> None:
     palms = [
         PANDA,
-        Gripper.like_panda({"palm_length": 0.3}),
-        Gripper.like_panda({"palm_length": 0.3, "palm_depth": 0.2}),
+        PANDA.with_sizes({"palm_length": 0.3}),
+        PANDA.with_sizes({"palm_length": 0.3, "palm_depth": 0.2}),
     ]
     rejected = []
     for gripper in palms:
@@ -151,8 +151,12 @@ def test_a_larger_palm_comes_nearer_to_the_support() -> None:
 
 @pytest.mark.parametrize(
     ("gripper", "words"),
-    [(Gripper(max_width=0.081), r"0\.081.*0\.08 m in max_width"), ("panda", "of type str"), (None, "of type NoneType")],
+    [
+        (Gripper(max_width=0.161), r"0\.161 m \(limit 0\.16 m\); give"),
+        ("panda", "of type str"),
+        (None, "of type NoneType"),
+    ],
 )
-def test_a_hand_that_the_networks_do_not_know_is_refused(gripper: Any, words: str) -> None:
+def test_what_is_no_hand_or_opens_too_wide_is_refused(gripper: Any, words: str) -> None:
     with pytest.raises(InvalidQuery, match=f"gripper: .*{words}"):
         ask(np.zeros((4, 3)), gripper=gripper)

@@ -12,7 +12,7 @@ from scipy.spatial import ConvexHull
 
 from simharness.sim.hand import FINGER_BASE, MAX_WIDTH, Hand
 from simharness.sim.world import World, data_path
-from tesnet.geometry import HAND_TO_TCP, PANDA, Pose
+from tesnet.geometry import PANDA, Pose
 
 pytestmark = pytest.mark.sim
 
@@ -39,7 +39,7 @@ def test_the_hand_is_placed_by_its_tcp(world: World) -> None:
     np.testing.assert_allclose(hand.T_world_grasp.matrix, wanted.matrix, atol=1e-9)
     assert hand.width == pytest.approx(0.05)
     base = world.pose(hand.body)
-    np.testing.assert_allclose(base.translation, wanted.apply([0.0, 0.0, -HAND_TO_TCP]), atol=1e-9)
+    np.testing.assert_allclose(base.translation, wanted.apply([0.0, 0.0, -PANDA.hand_to_tcp]), atol=1e-9)
 
 
 def test_the_fingertips_are_112_mm_from_the_hands_base(world: World) -> None:
@@ -48,7 +48,7 @@ def test_the_fingertips_are_112_mm_from_the_hands_base(world: World) -> None:
     hand.place(grasp(0.0, 0.0, 0.1).matrix, MAX_WIDTH)
     gap = world.distance(hand.body, floor, limit=0.2)
     assert gap is not None
-    base_height = 0.1 + HAND_TO_TCP
+    base_height = 0.1 + PANDA.hand_to_tcp
     assert base_height - gap == pytest.approx(0.112 + MARGIN, abs=0.0005)
 
 
@@ -63,7 +63,7 @@ def test_the_published_meshes_are_the_hands_parts(width: float) -> None:
     for part, solid in zip(PANDA.parts, solids, strict=True):
         planes = ConvexHull(part.corners(width)).equations
         # The finger's root reaches into the palm, which covers it.
-        in_reach = solid[solid[:, 2] - HAND_TO_TCP > part.back] - [0.0, 0.0, HAND_TO_TCP]
+        in_reach = solid[solid[:, 2] - PANDA.hand_to_tcp > part.back] - [0.0, 0.0, PANDA.hand_to_tcp]
         outside = (in_reach @ planes[:, :3].T + planes[:, 3]).max(axis=1)
         assert outside.max() < 0.0021
         # And no part is much larger than its mesh.

@@ -1,20 +1,18 @@
 from __future__ import annotations
 
-import dataclasses
-
 import numpy as np
 import pytest
 
-from tesnet.geometry import HAND_TO_TCP, PANDA, Gripper
+from tesnet.geometry import PANDA
 
 
 @pytest.mark.parametrize("width", [0.0, 0.03, 0.08])
 def test_the_corners_are_the_pandas(width: float) -> None:
     corners = PANDA.corners(width)
-    z = corners[:, 2] + HAND_TO_TCP
+    z = corners[:, 2] + PANDA.hand_to_tcp
     # From the hand's base: the body from -0.026 to 0.066, fingertips at 0.112.
     np.testing.assert_allclose([z.min(), z.max()], [-0.026, 0.112], atol=5e-4)
-    np.testing.assert_allclose(PANDA.palm_front + HAND_TO_TCP, 0.066, atol=5e-4)
+    np.testing.assert_allclose(PANDA.palm_front + PANDA.hand_to_tcp, 0.066, atol=5e-4)
     np.testing.assert_allclose(np.ptp(corners[:, :2], axis=0), [0.063, 0.204])
     tips = corners[corners[:, 2] > 0]
     assert np.abs(tips[:, 1]).min() == pytest.approx(width / 2)  # the pads
@@ -40,22 +38,22 @@ def test_half_a_turn_about_z_maps_the_hand_onto_itself() -> None:
     assert {tuple(corner) for corner in corners.round(9)} == {tuple(corner) for corner in turned.round(9)}
 
 
-@pytest.mark.parametrize("name", [field.name for field in dataclasses.fields(Gripper)])
+@pytest.mark.parametrize("name", sorted(PANDA.sizes().keys() - {"hand_yaw"}))
 def test_lengths_must_be_positive(name: str) -> None:
     with pytest.raises(ValueError, match=f"{name} is 0"):
-        Gripper(**{name: 0.0})
+        PANDA.with_sizes({name: 0.0})
 
 
 def test_a_part_whose_size_is_given_is_straight_unless_its_end_is_given_too() -> None:
-    assert Gripper.like_panda({}) == PANDA
-    straight = Gripper.like_panda({"finger_thickness": 0.02, "palm_breadth": 0.05})
+    assert PANDA.with_sizes({}) == PANDA
+    straight = PANDA.with_sizes({"finger_thickness": 0.02, "palm_breadth": 0.05})
     assert (straight.finger_tip_thickness, straight.palm_front_breadth) == (0.02, 0.05)
-    tapered = Gripper.like_panda({"finger_thickness": 0.02, "finger_tip_thickness": 0.01})
+    tapered = PANDA.with_sizes({"finger_thickness": 0.02, "finger_tip_thickness": 0.01})
     assert tapered.finger_tip_thickness == 0.01
 
 
 def test_a_taper_is_no_longer_than_its_part() -> None:
-    short = Gripper.like_panda({"finger_depth": 0.02, "palm_depth": 0.03})
+    short = PANDA.with_sizes({"finger_depth": 0.02, "palm_depth": 0.03})
     assert short.finger_taper == pytest.approx(short.finger_length)
     assert short.palm_taper == 0.03
     assert short.corners(0.08)[:, 2].min() == pytest.approx(short.palm_front - 0.03)
@@ -71,4 +69,4 @@ def test_a_taper_is_no_longer_than_its_part() -> None:
 )
 def test_a_hand_that_cannot_be_is_refused(lengths: dict[str, float], words: str) -> None:
     with pytest.raises(ValueError, match=words):
-        Gripper.like_panda(lengths)
+        PANDA.with_sizes(lengths)

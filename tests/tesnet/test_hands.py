@@ -1,0 +1,196 @@
+"""Known hands against what was measured of them, and those whose tips swing against a twin of their arc."""
+
+from __future__ import annotations
+
+import dataclasses
+import importlib
+import math
+from typing import Any
+
+import numpy as np
+import pytest
+import torch
+
+from tesnet import candidates, collision
+from tesnet.geometry import PANDA, WIDEST, GraspSet, Gripper, Pose
+from tesnet.hands import HANDS
+from tests.tesnet.scenes import bare_cloud
+
+NAMES = tuple(HANDS)
+ARCS = tuple(name for name, hand in HANDS.items() if hand.gripper.linkage_length)
+
+BASE_TO_TCP = {
+    "robotiq_2f85": {0.085: 0.1306, 0.04: 0.1425, 0.0: 0.1441},
+    "robotiq_2f140": {0.128: 0.1770, 0.04: 0.1986, 0.0: 0.2007},
+    "xarm": {0.085: 0.1439, 0.04: 0.1542, 0.0: 0.1546},
+    "rg2": {0.1041: 0.1752, 0.04: 0.2143, 0.0: 0.2188},
+    "rg6": {0.1514: 0.2096, 0.04: 0.2625, 0.0: 0.2652},
+    "ag95": {0.0952: 0.1674, 0.04: 0.1826, 0.0: 0.1831},
+    "franka": {0.08: 0.1034, 0.0: 0.1034},
+    "wsg50": {0.11: 0.1444, 0.0: 0.1444},
+    "hand_e": {0.05: 0.135, 0.0: 0.135},
+}
+"""Metres from the base link to the TCP by opening, by forward kinematics on the published descriptions."""
+
+
+def from_base(hand: Gripper, width: float) -> float:
+    """The closed form, written out again: A + sqrt(L^2 - (w / 2 - B)^2) - tip_offset."""
+    if hand.linkage_length is None:
+        return hand.hand_to_tcp
+    a = hand.hand_to_tcp - math.sqrt(hand.linkage_length**2 - (hand.max_width / 2 - hand.linkage_offset) ** 2)
+    return a + math.sqrt(hand.linkage_length**2 - (width / 2 - hand.linkage_offset) ** 2)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_a_hand_has_the_name_of_its_file(name: str) -> None:
+    module = importlib.import_module(f"tesnet.hands.{name}")
+    assert HANDS[name] is module.HAND
+    assert HANDS[name].gripper.name == name
+    assert 0 < HANDS[name].gripper.max_width <= WIDEST
+    assert 0 < HANDS[name].min_force <= HANDS[name].max_force
+    assert module.__doc__
+    assert "easured on the" in module.__doc__
+
+
+def test_every_file_of_a_hand_is_listed_and_the_first_is_the_default() -> None:
+    folder = importlib.resources.files("tesnet.hands")
+    files = {entry.name[:-3] for entry in folder.iterdir() if entry.name.endswith(".py")}
+    assert set(HANDS) == files - {"__init__", "hand"}
+    assert next(iter(HANDS.values())).gripper is PANDA
+    assert {name for name, hand in HANDS.items() if not hand.simulated} == {"wsg50", "xarm", "rg6", "ag95"}
+
+
+@pytest.mark.parametrize(("name", "width"), [(name, width) for name, row in BASE_TO_TCP.items() for width in row])
+def test_the_tcp_is_where_forward_kinematics_have_it(name: str, width: float) -> None:
+    # Of a crank that lies nearly flat a tenth of a millimetre of opening is four of height.
+    tolerance = 4e-4 if width > 0.1 else 1.1e-4
+    hand = HANDS[name].gripper
+    assert from_base(hand, width) == pytest.approx(BASE_TO_TCP[name][width], abs=tolerance)
+    assert hand.tcp_at(width) == pytest.approx(from_base(hand, width), abs=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_travel_is_that_of_the_farthest_tip_while_the_hand_closes(name: str) -> None:
+    hand = HANDS[name].gripper
+    rises = [from_base(hand, width) for width in np.linspace(0, hand.max_width, 2001)]
+    assert hand.travel == pytest.approx(max(rises) - rises[-1], abs=1e-6)
+    assert (hand.travel > 0) == (name in ARCS)
+    widths = torch.linspace(0, hand.max_width, 7, dtype=torch.float64)
+    expected = [from_base(hand, width) for width in widths.tolist()]
+    np.testing.assert_allclose(np.broadcast_to(hand.tcp_at(widths), 7), expected, atol=1e-12)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_closed_palm_is_covered_at_every_opening(name: str) -> None:
+    """In the frame of the base the palm stands still, so the part, which moves with the tips, must be long enough."""
+    hand = HANDS[name].gripper
+    palm = hand.parts[2]
+    backs = [palm.back + hand.tcp_at(width) for width in (0.0, 0.04, hand.max_width)]
+    assert max(backs) < 0.035  # the body begins at the base link, or behind it
+    assert hand.palm_depth > hand.travel
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_check_and_the_samples_hold_for_a_hand(name: str) -> None:
+    hand = HANDS[name].gripper
+    for width in (0.0, 0.6 * hand.max_width, hand.max_width):
+        samples = np.array([place for part in hand.parts for place in collision._samples(part, width)])
+        corners = hand.corners(width)
+        assert (samples <= corners.max(axis=0) + 1e-9).all()
+        assert (samples >= corners.min(axis=0) - 1e-9).all()
+        inner = samples * [1, 1 + 1e-6, 1] - [0, 0, 1e-5]
+        hits = collision.in_collision(torch.tensor(inner).float(), torch.eye(4)[None], hand, width, 0.0)
+        assert hits.all()
+
+
+# Placing and clearance
+
+
+@pytest.mark.parametrize("name", NAMES)
+@pytest.mark.parametrize("width", [0.0, 0.03, 0.05])
+def test_the_base_link_stands_behind_the_tcp_in_its_own_axes(name: str, width: float) -> None:
+    hand = HANDS[name].gripper
+    T = Pose.random(np.random.default_rng(1), reach=0.5)
+    points = np.zeros((1, 3))
+    grasps = GraspSet(np.ones(1), T.matrix[None], np.array([width]), points, points, hand)
+    base = grasps.hand_poses[0]
+    np.testing.assert_allclose(base[:3, 3], T.apply([0.0, 0.0, -from_base(hand, width)]), atol=1e-12)
+    np.testing.assert_allclose(base[:3, 2], T.rotation[:, 2], atol=1e-12)
+    closing = base[:3, 0] if hand.hand_yaw else base[:3, 1]
+    np.testing.assert_allclose(closing, T.rotation[:, 1], atol=1e-12)
+    other = grasps.in_convention("contact_graspnet")[0]
+    np.testing.assert_allclose(other[:3, 3], base[:3, 3], atol=1e-12)
+    np.testing.assert_allclose(other[:3, :3], np.stack([T.rotation[:, 1], -T.rotation[:, 0], T.rotation[:, 2]], 1))
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_tips_come_to_lie_7_mm_past_the_contact_once_they_have_closed_up_to_it(name: str) -> None:
+    hand = HANDS[name].gripper
+    rng = np.random.default_rng(2)
+    approach = torch.from_numpy(rng.uniform(-0.1, 0.1, (30, 3)))
+    normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(30, 3))), dim=1)
+    contact = approach + torch.from_numpy(rng.uniform(-0.02, 0.02, (30, 3)))
+    poses = candidates.grasp_poses(approach, contact, normals, hand=hand).numpy()
+    for T, p_a, p_c, n_c in zip(poses, approach.numpy(), contact.numpy(), normals.numpy(), strict=True):
+        along = (p_c - p_a) @ n_c
+        closed = 2 * min(max(along, 0.0), hand.max_width / 2)
+        advance = from_base(hand, closed) - from_base(hand, hand.max_width)
+        tips = T[:3, 3] + (advance + hand.tip_offset) * T[:3, 2]
+        assert (tips - p_c) @ T[:3, 2] == pytest.approx(0.007, abs=1e-9)
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_the_clearance_holds_for_the_lowest_tip_on_the_way(name: str) -> None:
+    hand = HANDS[name].gripper
+    rng = np.random.default_rng(3)
+    up = np.array([0.0, 0.6, 0.8])
+    cloud = bare_cloud(rng.uniform(-0.1, 0.1, (50, 3)), up=torch.tensor(up).float(), support_height=-0.1)
+    Ts = np.array([Pose.random(rng, reach=0.1).matrix for _ in range(40)])
+    found = candidates.hand_clearance(cloud, torch.from_numpy(Ts).float(), hand).numpy()
+    for T, clearance in zip(Ts, found, strict=True):
+        lowest = np.inf
+        for width in np.linspace(hand.max_width, 0, 200) if name in ARCS else [hand.max_width]:
+            advance = from_base(hand, width) - from_base(hand, hand.max_width)
+            fingers = np.concatenate([part.corners(width) for part in hand.parts[:2]]) + np.array([0, 0, advance])
+            places = np.concatenate([fingers, hand.parts[2].corners(width)]) @ T[:3, :3].T + T[:3, 3]
+            lowest = min(lowest, float((places @ up).min()) + 0.1)
+        assert clearance == pytest.approx(lowest, abs=4e-4)
+        assert clearance > lowest - 1e-5  # never more than what was looked at
+
+
+@pytest.mark.parametrize("name", NAMES)
+def test_limits_of_candidates_follow_the_opening_and_the_depth_of_the_fingers(name: str) -> None:
+    hand = HANDS[name].gripper
+    limits = candidates.limits_for(hand, candidates.CandidateConfig())
+    assert limits.max_offset == pytest.approx(hand.max_width / 2 - 0.002)
+    assert limits.max_depth == pytest.approx(hand.finger_depth - 0.01)
+
+
+def test_a_hand_of_other_sizes_has_no_name() -> None:
+    robotiq = HANDS["robotiq_2f85"].gripper
+    longer = robotiq.with_sizes({"finger_depth": 0.06})
+    assert (longer.name, longer.finger_depth, longer.linkage_length) == (None, 0.06, robotiq.linkage_length)
+    assert robotiq.with_sizes({}) == robotiq
+    assert PANDA.with_sizes(robotiq.sizes()) == robotiq
+    assert set(PANDA.sizes()) == set(robotiq.sizes()) - {"linkage_length", "linkage_offset"}
+
+
+@pytest.mark.parametrize(
+    ("sizes", "words"),
+    [
+        ({"linkage_length": 0.03}, r"linkage_length is 0\.03; it must exceed 0\.04"),
+        ({"linkage_length": 0.06, "linkage_offset": -0.03}, r"must exceed 0\.07"),
+        ({"linkage_length": -0.1}, r"linkage_length is -0\.1"),
+        ({"hand_to_tcp": 0.0}, r"hand_to_tcp is 0"),
+    ],
+)
+def test_a_linkage_that_cannot_be_is_refused(sizes: dict[str, Any], words: str) -> None:
+    with pytest.raises(ValueError, match=words):
+        PANDA.with_sizes(sizes)
+
+
+def test_a_known_hand_cannot_be_changed() -> None:
+    with pytest.raises(dataclasses.FrozenInstanceError):
+        HANDS["rg2"].gripper.max_width = 1.0  # type: ignore[misc]
+    with pytest.raises(TypeError):
+        HANDS["mine"] = HANDS["rg2"]  # type: ignore[index]
