@@ -23,6 +23,7 @@ from client.reply import GraspReply
 from client.request import DEFAULT_DEPTH_SCALE, GraspOptions, GripperSize
 from client.session import DEFAULT_TIMEOUT, GraspClient
 from tesnet.geometry import FRAME_CONVENTIONS
+from tesnet.hands import HANDS
 
 DEFAULT_URL = "http://127.0.0.1:8000"
 API_KEY_VARIABLE = "GRASP_API_KEY"
@@ -113,7 +114,7 @@ def _options(chosen: argparse.Namespace) -> GraspOptions:
     if chosen.target_box is not None:
         options["target"] = {"box": {"min": chosen.target_box[:3], "max": chosen.target_box[3:]}}
     if chosen.gripper is not None:
-        options["gripper"] = cast("GripperSize", dict(chosen.gripper))
+        options["gripper"] = _gripper(chosen.gripper)
     for name in _PLAIN_OPTIONS:
         value = getattr(chosen, name)
         if value is not None:
@@ -148,11 +149,20 @@ def _height(text: str) -> float | str:
     return text if text == "auto" else _number(text)
 
 
-def _length(text: str) -> tuple[str, float]:
+def _hand_or_size(text: str) -> tuple[str, str | float]:
+    """`("name", NAME)` of a hand, or the name of a size and metres."""
     name, separator, value = text.partition("=")
-    if not separator:
-        raise argparse.ArgumentTypeError(f"{text} is not NAME=METRES")
-    return name, _number(value)
+    if separator:
+        return name, _number(value)
+    if not text.isidentifier():
+        raise argparse.ArgumentTypeError(f"{text} is neither a hand's name nor SIZE=METRES")
+    return "name", text
+
+
+def _gripper(given: Sequence[tuple[str, str | float]]) -> str | GripperSize:
+    if len(given) == 1 and given[0][0] == "name":
+        return str(given[0][1])
+    return cast("GripperSize", dict(given))
 
 
 def _parser() -> argparse.ArgumentParser:
@@ -231,10 +241,11 @@ def _parser() -> argparse.ArgumentParser:
     add("--max-candidates", type=int, metavar="N", help="search effort")
     add(
         "--gripper",
-        type=_length,
+        type=_hand_or_size,
         nargs="+",
-        metavar="NAME=M",
-        help="another hand than the Panda's: max_width=0.06 finger_depth=0.04 ...",
+        metavar="NAME",
+        help=f"another hand than the Franka's ({', '.join(HANDS)}), sizes (max_width=0.06 finger_depth=0.04 ...), or a "
+        "hand and what differs",
     )
     add("--unseen", choices=("free", "occupied"), help="the shadow behind observed points, for collisions")
     add("--pregrasp-distance", type=_number, metavar="M", help="how far behind the grasp the pregrasp lies")

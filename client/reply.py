@@ -5,7 +5,7 @@ from __future__ import annotations
 import email.utils
 import json
 from collections.abc import Mapping
-from dataclasses import dataclass
+from dataclasses import dataclass, replace
 from datetime import datetime, timezone
 from http import HTTPStatus
 from types import MappingProxyType
@@ -17,7 +17,7 @@ from pydantic import BaseModel, ValidationError
 
 from client.errors import ProblemError, ServiceUnreachable, UnexpectedResponse, problem_class
 from service import schemas
-from tesnet.geometry import Pose
+from tesnet.geometry import PANDA, Gripper, Pose
 
 STATUSES_OF_PROXIES = frozenset({401, 413, 429, 503, 504})
 """Statuses that mean the same from a proxy as from the service."""
@@ -52,7 +52,7 @@ class Grasp:
         score: probability of success, 0 to 1.
         pose: the grasp in the convention that was asked for; panda: origin at the TCP, +z the direction of travel,
             +y the closing direction.
-        hand_pose: the pose of `panda_hand`, whatever the convention.
+        hand_pose: the pose of the hand's base link, open by `width`, in its own axes, whatever the convention.
         pregrasp: where to begin the straight approach.
         width: the opening to set before approaching.
         approach_point: (3,) the point that the hand's centre line passes through.
@@ -113,7 +113,7 @@ class GraspReply:
         grasps: best first; empty where nothing was found.
         scores: (M,) probabilities of success.
         poses: (M, 4, 4) of the grasps, in the convention that was asked for.
-        hand_poses: (M, 4, 4) of `panda_hand`.
+        hand_poses: (M, 4, 4) of the hand's base link.
         pregrasps: (M, 4, 4) where to begin the straight approach.
         widths: (M,) openings to set.
         approach_points, contact_points: (M, 3).
@@ -124,6 +124,7 @@ class GraspReply:
         model: the network.
         request_id: names the request in the service's log.
         text: the JSON document as it came.
+        gripper: the hand that they are for; None where the service does not say, as before version 0.5.
     """
 
     grasps: tuple[Grasp, ...]
@@ -141,6 +142,7 @@ class GraspReply:
     model: ModelIdentity
     request_id: str
     text: str
+    gripper: Gripper | None
 
     def __len__(self) -> int:
         return len(self.grasps)
@@ -216,6 +218,10 @@ def grasp_reply(answer: Answer) -> GraspReply:
         )
     except ValueError as error:
         raise _unexpected(answer, f"a grasp is no rigid pose: {error}") from error
+    try:
+        gripper = None if document.gripper is None else _gripper(document.gripper)
+    except ValueError as error:
+        raise _unexpected(answer, f"its gripper is no hand: {error}") from error
     counts, size = document.counts, len(grasps)
     return GraspReply(
         grasps=grasps,
@@ -240,7 +246,13 @@ def grasp_reply(answer: Answer) -> GraspReply:
         model=_identity(document.model),
         request_id=document.request_id,
         text=answer.body.decode(),
+        gripper=gripper,
     )
+
+
+def _gripper(told: schemas.GripperOut) -> Gripper:
+    sizes = told.model_dump(exclude={"name", "parts"}, exclude_none=True)
+    return replace(PANDA.with_sizes(sizes), name=told.name)
 
 
 def model_reply(answer: Answer) -> ModelReply:

@@ -64,11 +64,12 @@ class TargetPoints(TypedDict):
 
 
 class GripperSize(TypedDict, total=False):
-    """A two-finger parallel hand, metres; what is left out is the Panda hand's. See `service.schemas.GripperSize`.
+    """A two-finger hand, metres; what is left out is that of the hand that `name` names, or the Franka hand's.
 
-    A part whose size is given is straight, unless its narrower end is given as well.
+    A part whose size is given is straight, unless its narrower end is given as well. See `service.schemas.GripperSize`.
     """
 
+    name: str
     max_width: float
     finger_depth: float
     finger_thickness: float
@@ -81,6 +82,11 @@ class GripperSize(TypedDict, total=False):
     palm_breadth: float
     palm_front_breadth: float
     palm_taper: float
+    tip_offset: float
+    hand_to_tcp: float
+    hand_yaw: float
+    linkage_length: float | None
+    linkage_offset: float
 
 
 class Intrinsics(TypedDict):
@@ -119,7 +125,7 @@ class GraspOptions(TypedDict, total=False):
         min_separation: `{"translation": 0.01, "rotation_deg": 15}`.
         num_approach_points: search effort (default 32).
         max_candidates: search effort (default 2000).
-        gripper: `{"max_width": 0.06, ...}`, at most 0.08 m wide (default: the Panda hand).
+        gripper: a known hand's name, as `tesnet.hands` has them (default `"franka"`), or `{"max_width": 0.06, ...}`.
         unseen: whether the shadow behind observed points is `"free"` (default) or `"occupied"` for collisions.
         pregrasp_distance: how far behind the grasp `pregrasp` lies (default 0.05).
         frame_convention: `"panda"` (default), `"graspnet"` or `"contact_graspnet"`.
@@ -138,7 +144,7 @@ class GraspOptions(TypedDict, total=False):
     min_separation: Separation
     num_approach_points: int
     max_candidates: int
-    gripper: GripperSize
+    gripper: str | GripperSize
     unseen: Literal["free", "occupied"]
     pregrasp_distance: float
     frame_convention: FrameConvention

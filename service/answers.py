@@ -12,6 +12,7 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import NotAcceptable, shortened
+from service.hands import described
 from service.schemas import GraspOptions
 from tesnet.geometry import quaternions_xyzw
 from tesnet.result import GraspResult
@@ -163,6 +164,7 @@ def _meta(result: GraspResult, model: ModelInfo, timings_ms: Mapping[str, float]
         "warnings": list(result.warnings),
         "timings_ms": {stage: round(milliseconds, 3) for stage, milliseconds in timings_ms.items()},
         "request_id": request_id,
+        "gripper": described(result.grasps.gripper),
     }
 
 

@@ -4,7 +4,6 @@ from __future__ import annotations
 
 from collections.abc import AsyncIterator, Callable
 from contextlib import asynccontextmanager
-from dataclasses import asdict
 
 import anyio.to_thread
 import msgspec
@@ -19,6 +18,7 @@ from service.access import DOCS_FILES, OPEN_PATHS, AccessMiddleware
 from service.batching import PredictionWorker, PredictorFactory
 from service.errors import NotReady, ServiceError, Unauthorized, problem_response
 from service.grasps import GraspEndpoint
+from service.hands import described, described_known
 from service.inference_protocol import inference_protocol
 from service.memory import Memory
 from service.metrics import Metrics
@@ -28,7 +28,8 @@ from service.payloads import CONTENT_TYPES
 from service.settings import Settings, service_version
 from service.viewer import viewer
 from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
-from tesnet.geometry import FRAME_CONVENTIONS, PANDA, Gripper
+from tesnet.geometry import FRAME_CONVENTIONS, PANDA
+from tesnet.hands import HANDS
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
 
 DESCRIPTION = """Point cloud in, ranked SE(3) grasps out. Lengths are metres; poses are in the frame of the request's
@@ -166,7 +167,8 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
                 configuration=msgspec.to_builtins(info.configuration),
             )
         ],
-        gripper=_gripper(PANDA),
+        gripper=schemas.GripperOut(**described(PANDA)),
+        hands=[schemas.HandOut(**described_known(hand)) for hand in HANDS.values()],
         frame_conventions=list(FRAME_CONVENTIONS),
         content_types=list(CONTENT_TYPES),
         limits=schemas.LimitsOut(
@@ -179,24 +181,6 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
             max_timeout_s=schemas.MAX_TIMEOUT_S,
         ),
         device=worker.device,
-    )
-
-
-def _gripper(hand: Gripper) -> schemas.GripperOut:
-    return schemas.GripperOut(
-        max_width=hand.max_width,
-        finger_depth=hand.finger_depth,
-        finger_thickness=hand.finger_thickness,
-        finger_breadth=hand.finger_breadth,
-        hand_to_tcp=PANDA.hand_to_tcp,
-        parts=[
-            schemas.PartOut(
-                name=part.name,
-                side=part.side,
-                sections=[schemas.SectionOut(**asdict(section)) for section in part.sections],
-            )
-            for part in hand.parts
-        ],
     )
 
 

@@ -8,11 +8,13 @@ otherwise.
 from __future__ import annotations
 
 from collections.abc import Sequence
+from math import pi
 from typing import Annotated, Literal
 
 from pydantic import BaseModel, ConfigDict, Field, model_validator
 
-from tesnet.geometry import PANDA, FrameConvention, PartName
+from tesnet.geometry import PANDA, WIDEST, FrameConvention, PartName
+from tesnet.hands import HANDS
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_SEED, MAX_VIEWPOINTS
 from tesnet.result import Reason
 
@@ -76,14 +78,17 @@ Length = Annotated[float, Field(gt=0, le=0.5)]
 
 
 class GripperSize(RequestPart):
-    """A two-finger parallel hand, metres; what is left out is the Panda hand's.
+    """A two-finger hand with parallel pads, metres; what is left out is that of the hand that `name` names.
 
-    A part whose size is given is straight, unless its narrower end is given as well.
+    A part whose size is given is straight, unless its narrower end is given as well. Defaults are the Franka hand's.
     """
 
-    max_width: Annotated[float, Field(ge=0.005, le=PANDA.max_width)] = Field(
+    name: str | None = Field(
+        default="franka", max_length=64, description=f"A known hand that this one is like: {', '.join(HANDS)}."
+    )
+    max_width: Annotated[float, Field(ge=0.005, le=WIDEST)] = Field(
         default=PANDA.max_width,
-        description=f"Opening between the pads, 0.005 to {PANDA.max_width:g}: no network was trained with a wider one.",
+        description=f"Opening between the pads, 0.005 to {WIDEST:g}; a hand that opens wider can be told to open less.",
     )
     finger_depth: Annotated[float, Field(ge=0.015, le=0.5)] = Field(
         default=PANDA.finger_depth, description="Usable length of the fingers, measured back from the tips."
@@ -111,6 +116,25 @@ class GripperSize(RequestPart):
     palm_front_breadth: Length = Field(default=PANDA.palm_front_breadth, description="The same, at the fingers.")
     palm_taper: Length = Field(
         default=PANDA.palm_taper, description="Over how much of its depth, from the fingers, the body gets broader."
+    )
+    tip_offset: Length = Field(
+        default=PANDA.tip_offset, description="How far the fingertips lie beyond the TCP, the middle of the pads."
+    )
+    hand_to_tcp: Length = Field(
+        default=PANDA.hand_to_tcp, description="From the hand's base link to the TCP of the open hand, along z."
+    )
+    hand_yaw: Annotated[float, Field(ge=-pi, le=pi)] = Field(
+        default=PANDA.hand_yaw,
+        description="Angle about z from the grasp's axes to the base link's, radians; pi / 2 where the link closes "
+        "along its x.",
+    )
+    linkage_length: Length | None = Field(
+        default=None,
+        description="Of fingers on parallel cranks, whose tips also move along z: the cranks' length L. From the base "
+        "link the tips are at A + sqrt(L^2 - (width / 2 - B)^2). Default: the fingers slide.",
+    )
+    linkage_offset: Annotated[float, Field(ge=-0.5, le=0.5)] = Field(
+        default=PANDA.linkage_offset, description="B: half the opening at which the cranks point straight ahead."
     )
 
 
@@ -174,11 +198,11 @@ class GraspOptions(RequestPart):
         "0.9, up to four other searches follow, with four times as many approach points; the answer is that of the "
         "best one.",
     )
-    gripper: GripperSize | None = Field(
+    gripper: GripperSize | Annotated[str, Field(max_length=64)] | None = Field(
         default=None,
-        description='The hand, {"max_width": metres, "finger_depth": metres, "finger_thickness": metres, ...}; '
-        f"max_width is at most {PANDA.max_width:g}, the opening that the networks were trained with. Default: the "
-        "Panda hand.",
+        description=f"The hand: one of {', '.join(HANDS)}, or sizes "
+        '{"max_width": metres, "finger_depth": metres, ...}, with a "name" those of that hand but for the sizes given. '
+        f"It opens at most {WIDEST:g}. Default: franka.",
     )
     unseen: Literal["free", "occupied"] = Field(
         default="free",
@@ -248,7 +272,10 @@ class GraspOut(ResponsePart):
     )
     quaternion_xyzw: Quaternion = Field(description="Unit quaternion x, y, z, w of the axes of frame_convention.")
     matrix: Matrix = Field(description="The same pose as a 4 x 4 matrix T_cloud_grasp, row by row.")
-    hand_pose: PoseOut = Field(description="Pose of `panda_hand`, 0.1034 m behind the TCP; Panda axes always.")
+    hand_pose: PoseOut = Field(
+        description="Pose of the hand's base link, open by `width`, in its own axes always. Of the Franka hand that is "
+        "`panda_hand`, 0.1034 m behind the TCP."
+    )
     pregrasp: PoseOut = Field(description="TCP pose `pregrasp_distance` behind the grasp; Panda axes always.")
     width: float = Field(description="Opening to set before approaching, metres.")
     approach_point: Vector = Field(description="Cloud point through which the hand's centre line passes, metres.")
@@ -313,6 +340,7 @@ class GraspResponse(ResponsePart):
     warnings: list[str] = Field(description="What the caller should know about the request.")
     timings_ms: TimingsOut
     request_id: str = Field(description="X-Request-ID of this request.")
+    gripper: GripperOut | None = Field(default=None, description="The hand that the grasps are for.")
 
 
 class Problem(ResponsePart):
@@ -355,16 +383,38 @@ class PartOut(ResponsePart):
 
 
 class GripperOut(ResponsePart):
-    """The hand that collision checks and candidates assume, metres."""
+    """A hand, by the names and in the units of a request's `gripper`."""
 
+    name: str | None = Field(default=None, description="Its name, if it is a known hand.")
     max_width: float = Field(description="Largest opening between the finger pads.")
     finger_depth: float = Field(description="Usable length of the fingers, measured back from the tips.")
     finger_thickness: float = Field(description="Extent of one finger along the closing direction.")
+    finger_tip_thickness: float | None = Field(default=None, description="The same, at its tip.")
+    finger_taper: float | None = Field(default=None, description="Over how much of its length a finger gets thicker.")
     finger_breadth: float = Field(description="Extent of one finger across the hand's plane.")
-    hand_to_tcp: float = Field(description="From `panda_hand` to the TCP, along z.")
+    finger_tip_breadth: float | None = Field(default=None, description="The same, at its very tip.")
+    palm_depth: float | None = Field(default=None, description="Extent of the body along the direction of travel.")
+    palm_length: float | None = Field(default=None, description="Its extent along the closing direction.")
+    palm_breadth: float | None = Field(default=None, description="Its extent across the hand's plane.")
+    palm_front_breadth: float | None = Field(default=None, description="The same, at the fingers.")
+    palm_taper: float | None = Field(default=None, description="Over how much of its depth the body gets broader.")
+    tip_offset: float | None = Field(default=None, description="How far the fingertips lie beyond the TCP.")
+    hand_to_tcp: float = Field(description="From the hand's base link to the TCP of the open hand, along z.")
+    hand_yaw: float | None = Field(default=None, description="Angle about z from the grasp's axes to the base link's.")
+    linkage_length: float | None = Field(default=None, description="L, if the tips move along z as the hand closes.")
+    linkage_offset: float | None = Field(default=None, description="B of such a hand.")
     parts: list[PartOut] = Field(
         default_factory=list, description="The solids that the collision check takes the hand for."
     )
+
+
+class HandOut(GripperOut):
+    """A known hand."""
+
+    min_force: float = Field(description="The least force that it can be told to press with, newtons.")
+    max_force: float = Field(description="The greatest one.")
+    max_payload: float = Field(description="What it carries by friction, kilograms.")
+    simulated: bool = Field(description="Whether results in simulation are claimed for it.")
 
 
 class LimitsOut(ResponsePart):
@@ -390,7 +440,10 @@ class ModelResponse(ResponsePart):
     """Answer of `GET /model`."""
 
     models: list[NetworkOut] = Field(description="The loaded networks; the first is the default.")
-    gripper: GripperOut
+    gripper: GripperOut = Field(description="The default hand.")
+    hands: list[HandOut] = Field(
+        default_factory=list, description="Every hand that a request's `gripper` may name; the first is the default."
+    )
     frame_conventions: list[str] = Field(description="Valid values of `frame_convention`.")
     content_types: list[str] = Field(description="Content types that `POST /grasps` decodes.")
     limits: LimitsOut

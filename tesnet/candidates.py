@@ -281,8 +281,8 @@ def grasp_poses(
     """TCP poses (C, 4, 4) of the open hand for pairs of points (C, 3) and the contact points' unit normals (C, 3).
 
     z = d_perp / |d_perp| with d_perp the part of d = p_c - p_a across the normal; y = the normal; the fingertips stop
-    7 mm past the depth of the contact point on the line through p_a (CONVENTIONS.md, "From two points to a grasp"), once
-    they have closed up to it.
+    7 mm past the depth of the contact point on the line through p_a (CONVENTIONS.md, "From two points to a grasp"),
+    once they have closed up to it.
     """
     d = contact_points - approach_points
     along = (d * contact_normals).sum(dim=1, keepdim=True)

@@ -6,9 +6,9 @@ import numpy as np
 from numpy.typing import NDArray
 
 from service.errors import Invalid
+from service.hands import gripper_of
 from service.payloads.payload import Payload
-from service.schemas import GraspOptions, GripperSize
-from tesnet.geometry import PANDA, Gripper
+from service.schemas import GraspOptions
 from tesnet.query import ApproachCone, GraspQuery, Target, box_option
 
 
@@ -36,7 +36,7 @@ def build_query(payload: Payload, options: GraspOptions) -> GraspQuery:
         separation_rotation_deg=options.min_separation.rotation_deg,
         num_approach_points=options.num_approach_points,
         max_candidates=options.max_candidates,
-        gripper=PANDA if options.gripper is None else _gripper(options.gripper),
+        gripper=gripper_of(options.gripper),
         unseen=options.unseen,
         seed=options.seed,
     )
@@ -65,10 +65,3 @@ def _target(payload: Payload, options: GraspOptions) -> Target | None:
 def _of_points(mask: NDArray[np.bool_], payload: Payload) -> NDArray[np.bool_]:
     """The mask (N,) of points for a mask (R,) of what was posted."""
     return mask if payload.is_point is None else mask[payload.is_point]
-
-
-def _gripper(size: GripperSize) -> Gripper:
-    try:
-        return PANDA.with_sizes(size.model_dump(exclude_unset=True))
-    except ValueError as error:
-        raise Invalid("gripper", str(error)) from None

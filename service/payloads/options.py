@@ -151,6 +151,9 @@ def unknown_option(name: str) -> Invalid:
 _UNIONS = frozenset({"viewpoint", "support_height"})
 """Options of several types, whose names pydantic puts into an error's location."""
 
+_TYPES = frozenset({"GripperSize", "constrained-str"})
+"""Names of types of an option that has parts, too."""
+
 
 def _invalid_option(model: type[BaseModel], error: ValidationError, given: RawOptions) -> Invalid:
     first = error.errors(include_url=False, include_input=False)[0]
@@ -158,7 +161,7 @@ def _invalid_option(model: type[BaseModel], error: ValidationError, given: RawOp
         return Invalid(next(iter(given)), f"or another option cannot be read: {shortened(first['msg'])}")
     name, *inside = first["loc"]
     field = str(name)
-    path = [str(part) for part in inside if field not in _UNIONS]
+    path = [str(part) for part in inside if field not in _UNIONS and part not in _TYPES]
     where = f" (at {'.'.join(path)})" if path else ""
     what = first["msg"][:1].lower() + first["msg"][1:]
     expected = model.model_fields[field].description

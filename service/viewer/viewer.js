@@ -10,12 +10,10 @@ const scene = new Scene(element("canvas"));
 let points = null; // Float32Array of x, y, z triples
 
 async function post(address, body, type, accept) {
-  return request(address, { method: "POST", headers: { Accept: accept, ...(type && { "Content-Type": type }) }, body });
-}
-
-async function request(address, { headers = {}, ...options } = {}) {
+  const headers = { Accept: accept };
+  if (type) headers["Content-Type"] = type;
   if (element("key").value) headers["X-API-Key"] = element("key").value;
-  const answer = await fetch(address, { ...options, headers });
+  const answer = await fetch(address, { method: "POST", headers, body });
   if (answer.ok) return answer;
   const problem = await answer.json().catch(() => ({ title: answer.statusText }));
   throw new Error(`${answer.status}: ${problem.detail ?? problem.title}`);
@@ -70,11 +68,10 @@ async function ask() {
   say("Asking ...");
   const answer = await post(`/grasps?${query.join("&")}`, points, "application/octet-stream", "application/json");
   const reply = await answer.json();
-  const { gripper } = await (await request("/model")).json();
   const { points: posted, candidates, collision_free: free } = reply.counts;
   const found = reply.grasps.length ? `${reply.grasps.length} grasps` : `No grasp: ${reply.reason.replaceAll("_", " ")}`;
   say(`${found} · ${posted} points, ${candidates} candidates, ${free} of them free · ${Math.round(reply.timings_ms.total)} ms`);
-  scene.showGrasps(reply.grasps.map((grasp) => seen(grasp, options.pregrasp_distance)), gripper.parts);
+  scene.showGrasps(reply.grasps.map((grasp) => seen(grasp, options.pregrasp_distance)), reply.gripper.parts);
   list(reply, options.frame_convention ?? "panda");
 }
 

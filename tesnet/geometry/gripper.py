@@ -114,7 +114,7 @@ class Gripper:
         """A hand that differs from this one in the sizes given, by their names; it has no name.
 
         A part whose size is given is straight, unless its tapered end is given as well; a taper that would be longer
-        than its part is cut.
+        than its part is cut. Where cranks open less, the base link stays where it is: `hand_to_tcp` follows.
 
         Raises:
             ValueError: as for any `Gripper`.
@@ -123,6 +123,8 @@ class Gripper:
         for whole, end in _TAPERED.items():
             if whole in given:
                 given.setdefault(end, given[whole])
+        if "max_width" in given and self.linkage_length and given["max_width"] <= self.max_width:
+            given.setdefault("hand_to_tcp", self.tcp_at(given["max_width"]))
         hand = replace(self, **given, name=None)
         return replace(
             hand,

@@ -246,7 +246,7 @@ def model_document() -> dict[str, Any]:
         "models": [
             {"name": "tesnet", "version": "1", "weights_sha256": "ab" * 32, "card": {"seed": 0}, "configuration": {}}
         ],
-        "gripper": {**dict.fromkeys(schemas.GripperOut.model_fields, 0.08), "parts": []},
+        "gripper": {**dict.fromkeys(schemas.GripperOut.model_fields, 0.08), "name": "franka", "parts": []},
         "frame_conventions": ["panda", "graspnet"],
         "content_types": ["application/octet-stream"],
         "limits": dict.fromkeys(schemas.LimitsOut.model_fields, 1000),

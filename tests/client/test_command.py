@@ -91,6 +91,23 @@ def test_nothing_found_prints_the_reason_and_exits_1(
     assert json.loads(capsys.readouterr().out) == nothing_found
 
 
+@pytest.mark.parametrize(
+    ("words", "asked"),
+    [
+        ("rg2", "rg2"),
+        ("rg2 max_width=0.05", {"name": "rg2", "max_width": 0.05}),
+        ("max_width=0.05", {"max_width": 0.05}),
+    ],
+)
+def test_a_hand_is_named_or_described(
+    server: ScriptedServer, cloud: str, found: dict[str, Any], words: str, asked: Any
+) -> None:
+    server.script = [answering(found)]
+    assert main([cloud, "--url", server.url, "--gripper", *words.split()]) == 0
+    query = parse_qs(urlsplit(server.received[0].target).query)
+    assert json.loads(query["gripper"][0]) == asked
+
+
 def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict[str, Any]) -> None:
     server.script = [answering(found)]
     flags = (

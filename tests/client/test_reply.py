@@ -13,6 +13,7 @@ import pytest
 
 import client
 from client.reply import Answer, grasp_reply, model_reply, problem
+from tesnet.hands import HANDS
 
 if TYPE_CHECKING:
     from tests.client.conftest import Answering
@@ -20,6 +21,17 @@ if TYPE_CHECKING:
 
 def _answer(document: object, status: int = 200) -> Answer:
     return Answer(status, {"content-type": "application/json"}, json.dumps(document).encode())
+
+
+def test_the_hand_that_answered_is_a_gripper_and_older_services_say_none(found: dict[str, Any]) -> None:
+    hand = HANDS["rg2"].gripper.with_sizes({"max_width": 0.05})
+    told = {"name": "mine", **hand.sizes(), "parts": []}
+    reply = grasp_reply(_answer({**found, "gripper": told}))
+    assert reply.gripper == hand
+    assert reply.gripper.name == "mine"
+    assert grasp_reply(_answer({name: value for name, value in found.items() if name != "gripper"})).gripper is None
+    with pytest.raises(client.UnexpectedResponse, match="no hand"):
+        grasp_reply(_answer({**found, "gripper": {**told, "finger_depth": 0.001}}))
 
 
 def test_every_field_of_the_document_arrives(found: dict[str, Any]) -> None:
