@@ -18,7 +18,7 @@ import numpy as np
 from jaxtyping import Float
 from numpy.typing import NDArray
 
-from simharness.sim.hand import MAX_WIDTH, Hand, HandContact, Placement, placements
+from simharness.sim.hand import Hand, HandContact, Placement, placements
 from simharness.sim.outcomes import OutcomeKind
 from simharness.sim.scene import settle
 from simharness.sim.world import TIMESTEP, World
@@ -30,9 +30,6 @@ PREGRASP_DISTANCE = 0.05
 RETREAT_DISTANCE = 0.1
 SPEED = 0.1
 """Metres, and metres a second."""
-
-EMPTY_WIDTH = 0.1 * MAX_WIDTH
-"""Fingers this close together hold nothing."""
 
 LARGEST_RETREAT_ANGLE_DEG = 60.0
 """Hands that point farther from straight down than this retreat upwards."""
@@ -133,7 +130,7 @@ def attempt(world: World, hand: Hand, T_world_grasp: NDArray[np.float64], width:
         width: opening to approach with, metres.
         executor: which rules apply.
     """
-    grasp = placements(np.asarray(T_world_grasp, dtype=np.float64)[None], [width])[0]
+    grasp = placements(np.asarray(T_world_grasp, dtype=np.float64)[None], [width], hand.gripper)[0]
     at_start = hand.deepest_contact() if _touches(world, hand, grasp, PREGRASP_DISTANCE) else None
     if executor == "strict" and at_start is not None:
         return _finish(world, hand, "pregrasp", at_start, None)
@@ -183,7 +180,7 @@ def label_candidates(
     """
     world.restore(snapshot)
     labels = []
-    for grasp in placements(np.asarray(Ts_world_grasp, dtype=np.float64), widths.tolist()):
+    for grasp in placements(np.asarray(Ts_world_grasp, dtype=np.float64), widths.tolist(), hand.gripper):
         failure = _first_contact(world, hand, grasp)
         if failure is not None and not edge:
             labels.append(Labels(failure, None))
@@ -255,7 +252,7 @@ def _close_and_lift(world: World, hand: Hand, grasp: Placement, executor: Execut
     still = 0
     for _ in range(_CLOSING_STEPS // _STEPS_BETWEEN_CHECKS):
         world.step(_STEPS_BETWEEN_CHECKS)
-        if hand.width <= EMPTY_WIDTH:
+        if hand.width <= hand.empty_width:
             return _Lift(_NOTHING, _NOTHING)
         still = still + 1 if hand.finger_speed < _STILL else 0
         if still == _STILL_CHECKS:
@@ -269,7 +266,7 @@ def _close_and_lift(world: World, hand: Hand, grasp: Placement, executor: Execut
         travelled = step * _STEP_LENGTH
         hand.carry_to(grasp, behind=0.0 if upwards else travelled, above=travelled if upwards else 0.0)
         world.step()
-        if step % _STEPS_BETWEEN_CHECKS == 0 and hand.width <= EMPTY_WIDTH:
+        if step % _STEPS_BETWEEN_CHECKS == 0 and hand.width <= hand.empty_width:
             return _Lift(closed, _NOTHING)
         if not full_retreat and step % _STEPS_BETWEEN_LOOKS == 0:
             before, hanging = hanging, _hanging(world, hand)
@@ -281,7 +278,7 @@ def _close_and_lift(world: World, hand: Hand, grasp: Placement, executor: Execut
 def _grip(world: World, hand: Hand) -> Grip:
     touched, pinched = hand.touched(within=TOUCHING)
     objects = frozenset(world.objects)
-    return Grip(objects & touched, objects & pinched, empty=hand.width <= EMPTY_WIDTH)
+    return Grip(objects & touched, objects & pinched, empty=hand.width <= hand.empty_width)
 
 
 def _hanging(world: World, hand: Hand) -> dict[int, Pose]:

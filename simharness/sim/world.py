@@ -6,7 +6,7 @@ URDF: the base link's centre of mass, which Bullet makes the body's origin).
 
 from __future__ import annotations
 
-from collections.abc import Sequence
+from collections.abc import Callable, Sequence
 from dataclasses import dataclass
 from pathlib import Path
 from types import TracebackType
@@ -80,6 +80,7 @@ class World:
             physicsClientId=self._client,
         )
         self._objects: list[int] = []
+        self._before_step: list[Callable[[], None]] = []
 
     def __enter__(self) -> World:
         return self
@@ -276,7 +277,13 @@ class World:
     def step(self, steps: int = 1) -> None:
         """Advance physics by this many steps of `TIMESTEP`."""
         for _ in range(steps):
+            for prepare in self._before_step:
+                prepare()
             bullet.stepSimulation(physicsClientId=self._client)
+
+    def before_every_step(self, prepare: Callable[[], None]) -> None:
+        """Have something done before every step from now on, such as moving a joint as another one moves."""
+        self._before_step.append(prepare)
 
     def find_contacts(self) -> None:
         """Look for contacts where everything is now, without moving anything."""

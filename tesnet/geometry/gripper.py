@@ -87,7 +87,7 @@ class Gripper:
 
     def __post_init__(self) -> None:
         for name, value in self.sizes().items():
-            if name not in _OF_EITHER_SIGN and not value > 0:
+            if value is not None and name not in _OF_EITHER_SIGN and not value > 0:
                 raise ValueError(f"{name} is {value}; a gripper's lengths are positive, in metres")
         for whole, end in _TAPERED.items():
             if getattr(self, end) > getattr(self, whole):
@@ -110,7 +110,7 @@ class Gripper:
 
     # Factories
 
-    def with_sizes(self, sizes: Mapping[str, float]) -> Gripper:
+    def with_sizes(self, sizes: Mapping[str, float | None]) -> Gripper:
         """A hand that differs from this one in the sizes given, by their names; it has no name.
 
         A part whose size is given is straight, unless its tapered end is given as well; a taper that would be longer
@@ -134,13 +134,9 @@ class Gripper:
 
     # Accessors
 
-    def sizes(self) -> dict[str, float]:
-        """The hand's sizes by their names; `linkage_length` and `linkage_offset` only where it has cranks."""
-        return {
-            item.name: getattr(self, item.name)
-            for item in fields(self)
-            if item.name not in (("name",) if self.linkage_length else ("name", "linkage_length", "linkage_offset"))
-        }
+    def sizes(self) -> dict[str, float | None]:
+        """The hand's sizes by their names."""
+        return {item.name: getattr(self, item.name) for item in fields(self) if item.name != "name"}
 
     @property
     def finger_length(self) -> float:

@@ -19,7 +19,7 @@ HEAVY = {
     "matplotlib",
 }
 ALLOWED_SERVICE = {"service", "service.schemas"}
-ALLOWED_TESNET = ("tesnet.formats", "tesnet.geometry", "tesnet.query", "tesnet.result", "tesnet.errors")
+ALLOWED_TESNET = ("tesnet.formats", "tesnet.geometry", "tesnet.hands", "tesnet.query", "tesnet.result", "tesnet.errors")
 
 
 def test_the_client_pulls_in_nothing_heavy_and_of_the_service_the_wire_alone() -> None:

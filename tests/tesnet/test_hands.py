@@ -172,7 +172,10 @@ def test_a_hand_of_other_sizes_has_no_name() -> None:
     assert (longer.name, longer.finger_depth, longer.linkage_length) == (None, 0.06, robotiq.linkage_length)
     assert robotiq.with_sizes({}) == robotiq
     assert PANDA.with_sizes(robotiq.sizes()) == robotiq
-    assert set(PANDA.sizes()) == set(robotiq.sizes()) - {"linkage_length", "linkage_offset"}
+    assert robotiq.sizes()["linkage_length"] == 0.05715
+    limited = robotiq.with_sizes({"max_width": 0.04})
+    assert limited.hand_to_tcp == robotiq.tcp_at(0.04)
+    assert limited.tcp_at(0.02) == pytest.approx(robotiq.tcp_at(0.02))
 
 
 @pytest.mark.parametrize(

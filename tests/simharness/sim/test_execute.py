@@ -22,6 +22,7 @@ from simharness.sim.hand import MAX_WIDTH, Hand, Placement
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import TABLE_HEIGHT, restore_scene, settle
 from simharness.sim.world import BASE_LINK, World, data_path
+from tesnet.hands import HANDS, KnownHand
 
 pytestmark = pytest.mark.sim
 
@@ -32,7 +33,7 @@ MIDDLE = (0.15, 0.15)
 Place = tuple[float, float]
 
 
-def scene(world: World, *places: Place) -> tuple[Hand, tuple[int, ...]]:
+def scene(world: World, *places: Place, known: KnownHand = HANDS["franka"]) -> tuple[Hand, tuple[int, ...]]:
     """Cubes of 4 cm on the table, settled, and the hand."""
     items = [
         {
@@ -44,7 +45,7 @@ def scene(world: World, *places: Place) -> tuple[Hand, tuple[int, ...]]:
         for x, y in places
     ]
     restored = restore_scene(world, {"kind": "packed", "objects": items}, {"cube": CUBE})
-    hand = Hand(world)
+    hand = Hand(world, known)
     assert settle(world) == ()
     return hand, tuple(item.body_id for item in restored.placed)
 
@@ -71,6 +72,19 @@ def test_a_good_grasp_lifts_and_removes_the_object(executor: str) -> None:
         outcome = attempt(world, hand, from_above(), MAX_WIDTH, "strict" if executor == "strict" else "edge")
         assert outcome == Outcome("success", (cube,), contact_at_start=False, contact_on_way=False)
         assert world.objects == (other,)
+
+
+@pytest.mark.parametrize("name", ["robotiq_2f85", "robotiq_2f140", "hand_e", "rg2"])
+def test_other_hands_lift_the_object_too(name: str) -> None:
+    known = HANDS[name]
+    gripper = known.gripper
+    travel = gripper.tcp_at(SIDE) - gripper.hand_to_tcp
+    with World() as world:
+        hand, (cube,) = scene(world, MIDDLE, known=known)
+        # The tips come to lie 6 mm over the table once they have closed.
+        grasp = from_above(z=TABLE_HEIGHT + 0.006 + gripper.tip_offset + travel)
+        outcome = attempt(world, hand, grasp, gripper.max_width, "strict")
+        assert outcome == Outcome("success", (cube,), contact_at_start=False, contact_on_way=False)
 
 
 def test_a_contact_at_the_start_pose_is_noticed_by_the_strict_executor_only() -> None:

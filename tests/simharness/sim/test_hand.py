@@ -13,6 +13,7 @@ from scipy.spatial import ConvexHull
 from simharness.sim.hand import FINGER_BASE, MAX_WIDTH, Hand
 from simharness.sim.world import World, data_path
 from tesnet.geometry import PANDA, Pose
+from tesnet.hands import HANDS
 
 pytestmark = pytest.mark.sim
 
@@ -125,7 +126,7 @@ def test_the_constraint_carries_the_hand_and_gravity_does_not(world: World) -> N
 def test_the_deepest_contact_is_the_deepest_whichever_was_found_first(world: World, deep: int) -> None:
     hand = Hand(world)
     hand.place(grasp(0.0, 0.0, 0.2).matrix, MAX_WIDTH)  # turned over, so that its left finger is at negative y
-    tip = 0.2 - 0.112 + HAND_TO_TCP
+    tip = 0.2 - 0.112 + PANDA.hand_to_tcp
     depths = [0.006 if finger == deep else 0.002 for finger in (0, 1)]
     plates = [
         world.add_static_box((0.01, 0.01, 0.01), (0.0, side * 0.045, tip + depth - 0.01), colour=(1, 1, 1, 1))
@@ -152,7 +153,70 @@ def test_a_finger_that_moves_is_not_overlooked_for_one_that_stands(
 def test_what_the_palm_alone_touches_is_touched_and_not_pinched(world: World) -> None:
     hand = Hand(world)
     hand.place(grasp(0.0, 0.0, 0.2).matrix, MAX_WIDTH)
-    palm = 0.2 + HAND_TO_TCP - 0.03
+    palm = 0.2 + PANDA.hand_to_tcp - 0.03
     block = world.add_static_box((0.01, 0.01, 0.01), (0.0, 0.0, palm), colour=(1, 1, 1, 1))
     world.find_contacts()
     assert hand.touched(within=0.0) == ({block}, set())
+
+
+# Other hands
+
+OTHERS = tuple(name for name in HANDS if name != "franka")
+SWINGING = tuple(name for name, hand in HANDS.items() if hand.gripper.linkage_length)
+WHITE = (1.0, 1.0, 1.0, 1.0)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_the_solid_of_a_hand_is_that_of_its_parts(world: World, name: str) -> None:
+    """Small boxes 10 mm before its tips, inside of a pad and beside its palm are so far away."""
+    hand, gripper = Hand(world, HANDS[name]), HANDS[name].gripper
+    hand.place(grasp(0.0, 0.0, 0.3).matrix, gripper.max_width)
+    palm, tips = gripper.parts[2], 0.3 - gripper.tip_offset
+    places = {
+        "before the tips": (0.0, gripper.max_width / 2 + 0.003, tips - 0.011),
+        "inside of a pad": (0.0, gripper.max_width / 2 - 0.011, tips + 0.01),
+        "beside the palm": (0.0, palm.thickness.full / 2 + 0.011, 0.3 - palm.front + 0.015),
+    }
+    for position in places.values():
+        box = world.add_static_box((0.001, 0.001, 0.001), position, colour=WHITE)
+        assert world.distance(hand.body, box, limit=0.05) == pytest.approx(0.010, abs=0.0006)
+        world.remove(box)
+
+
+@pytest.mark.parametrize("name", SWINGING)
+def test_a_fingertip_follows_its_arc_as_the_hand_closes_on_nothing(world: World, name: str) -> None:
+    hand, gripper = Hand(world, HANDS[name]), HANDS[name].gripper
+    floor = world.add_static_box((0.5, 0.5, 0.05), (0.0, 0.0, 0.2), colour=WHITE)
+    hand.place(grasp(0.0, 0.0, 0.35).matrix, gripper.max_width)
+    base = world.pose(hand.body)
+    assert gripper.linkage_length is not None
+    open_rise = np.sqrt(gripper.linkage_length**2 - (gripper.max_width / 2 - gripper.linkage_offset) ** 2)
+    hand.close()
+    widths, errors = [], []
+    for _ in range(40):
+        world.step(3)
+        rise = np.sqrt(gripper.linkage_length**2 - (hand.width / 2 - gripper.linkage_offset) ** 2)
+        gap = world.distance(hand.body, floor, limit=0.2)
+        assert gap is not None
+        widths.append(hand.width)
+        errors.append(0.1 - gripper.tip_offset - gap - (rise - open_rise))
+    assert widths[0] > 0.9 * gripper.max_width
+    assert widths[-1] < 0.001
+    assert np.abs(errors).max() < 0.001
+    np.testing.assert_allclose(world.pose(hand.body).matrix, base.matrix, atol=1e-4)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_a_hand_closes_on_a_box_with_parallel_pads_and_presses(world: World, name: str) -> None:
+    thickness = 0.03
+    world.add_static_box((0.03, thickness / 2, 0.03), (0.0, 0.0, 0.0), colour=WHITE)
+    hand, gripper = Hand(world, HANDS[name]), HANDS[name].gripper
+    travel = gripper.tcp_at(thickness) - gripper.hand_to_tcp
+    hand.place(grasp(0.0, 0.0, 0.02 + travel).matrix, gripper.max_width)
+    world.find_contacts()
+    assert not hand.touches_anything()
+    hand.close()
+    world.step(150)
+    assert hand.width == pytest.approx(thickness, abs=0.001)
+    assert hand.finger_speed < 0.002
+    np.testing.assert_allclose(hand.T_world_grasp.translation, [0.0, 0.0, 0.02], atol=0.0015)
