@@ -178,6 +178,8 @@ def _add_settings(parser: argparse.ArgumentParser, part: Part) -> None:
 
 def _form(kind: Any, flag: Flag) -> dict[str, Any]:
     """How argparse is told what a flag takes."""
+    if flag.choices is not None:
+        return {"choices": flag.choices}
     if get_origin(kind) is Literal:
         return {"choices": get_args(kind)}
     kinds = {kind, *get_args(kind)}  # of `float | None` both

@@ -14,6 +14,7 @@ from simharness.sim.camera import Preset
 from tesnet import networks
 from tesnet.cloud import PreparationConfig
 from tesnet.errors import TesnetError
+from tesnet.hands import HANDS
 from training.archive import is_archive, pack, unpack
 from training.compare import compare
 from training.evaluate import evaluate
@@ -79,6 +80,7 @@ def _add_generate(parser: argparse.ArgumentParser) -> None:
         "--mine", type=Path, metavar="WEIGHTS", help="draw half of the others from what these score best"
     )
     parser.add_argument("--camera", choices=get_args(Preset), default="random")
+    parser.add_argument("--gripper", choices=tuple(HANDS), default="franka", help="the hand that tries the grasps")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=_positive, default=1)
     parser.add_argument("--ray", metavar="ADDRESS", help="make the scenes on this Ray cluster")
@@ -98,6 +100,7 @@ def _generate(options: argparse.Namespace) -> dict[str, object]:
         colliding_share=options.colliding_share,
         mine=options.mine,
         camera=options.camera,
+        gripper=options.gripper,
     )
     return generate(config, options.labels, options.workers, options.out, options.resume, options.ray)
 

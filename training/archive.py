@@ -175,6 +175,10 @@ def _read_scene(path: Path) -> tuple[dict[str, Any], list[ArchivedView]]:
         description["cameras"] = _cameras_of(description, views)
     archived = []
     for cameras, view in zip(description["cameras"], views, strict=True):
+        if view.gripper != "franka":
+            raise LabelsError(
+                f"{path} has labels of {view.gripper}; an archive keeps those of franka alone, leave it out"
+            )
         in_world = _moved(view.cloud.T_cloud_canonical, view.pairs.double().numpy())
         archived.append(ArchivedView(np.array(cameras), in_world, view.outcomes.numpy(), view.collision_free.numpy()))
     return description, archived

@@ -30,11 +30,11 @@ from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcomes import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
-from simharness.sim.scene import describe, make_scene
+from simharness.sim.scene import describe, make_scene, scales_for
 from simharness.sim.world import World
 from tesnet import candidates, cloud, networks
 from tesnet.collision import blocked
-from tesnet.geometry import PANDA
+from tesnet.hands import HANDS, KnownHand
 from tesnet.networks import Network
 from tesnet.whole_file import write_whole
 from training.views import LabelledView, LabelsError, count_outcomes, pairs_of, save_scene, scene_files
@@ -58,6 +58,7 @@ class GenerateConfig:
         mine: weights of a network; half of the candidates that do not collide are then drawn from the quarter that it
             scores best, where its mistakes become failed attempts.
         camera: preset.
+        gripper: name of the hand.
     """
 
     scene: Literal["packed", "pile"]
@@ -69,6 +70,12 @@ class GenerateConfig:
     colliding_share: float | None = 0.7
     mine: Path | None = None
     camera: Preset = "random"
+    gripper: str = "franka"
+
+    @property
+    def hand(self) -> KnownHand:
+        """The hand that `gripper` names."""
+        return HANDS[self.gripper]
 
 
 def generate(
@@ -210,9 +217,16 @@ def label_scene(
     rng = _rng(config, number)
     models = sets[int(rng.integers(len(sets)))]
     with World() as world:
-        hand = Hand(world)
+        hand = Hand(world, config.hand)
         # Fewer objects, too: a table that is being cleared holds fewer and fewer.
-        scene = make_scene(world, config.scene, models, rng, num_objects=int(rng.choice([1, 2, 3, 4, 5, 5])))
+        scene = make_scene(
+            world,
+            config.scene,
+            models,
+            rng,
+            num_objects=int(rng.choice([1, 2, 3, 4, 5, 5])),
+            scale_range=scales_for(config.scene, config.hand.gripper),
+        )
         description = describe(scene) | {"seed": config.seed, "number": number, "camera": config.camera, "cameras": []}
         views: list[LabelledView] = []
         if not scene.placed:
@@ -239,7 +253,7 @@ def _label_view(
     rng: np.random.Generator,
     network: Network | None,
 ) -> LabelledView | None:
-    query = query_about(observation, seed=int(rng.integers(2**31)))
+    query = query_about(observation, int(rng.integers(2**31)), hand.gripper)
     prepared = cloud.prepare(query, cloud.PreparationConfig(), torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
@@ -252,7 +266,7 @@ def _label_view(
     picked = found.select(which)
     Ts_world_grasp = prepared.T_cloud_canonical.matrix @ picked.Ts_canonical_grasp.double().numpy()
     with snapshot_of(world) as snapshot:
-        kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), PANDA.max_width), snapshot)
+        kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), hand.gripper.max_width), snapshot)
     return LabelledView(
         cloud=prepared,
         pairs=pairs_of(prepared, picked),
@@ -261,6 +275,7 @@ def _label_view(
         outcomes=torch.tensor([OUTCOME_KINDS.index(kind) for kind in kinds], dtype=torch.uint8),
         collision_free=free[which],
         scene=config.scene,
+        gripper=config.gripper,
     )
 
 

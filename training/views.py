@@ -17,6 +17,7 @@ from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import Pose
+from tesnet.hands import HANDS
 from tesnet.points import orient_normals
 from tesnet.whole_file import whole_file
 
@@ -39,6 +40,7 @@ class LabelledView:
         outcomes: (C,) codes into `OUTCOME_KINDS`.
         collision_free: (C,) whether the observed cloud left the hand's way free: such candidates the service scores.
         scene: kind of the scene, `packed` or `pile`.
+        gripper: name of the hand that tried them.
     """
 
     cloud: PreparedCloud
@@ -48,11 +50,14 @@ class LabelledView:
     outcomes: torch.Tensor
     collision_free: torch.Tensor
     scene: str
+    gripper: str = "franka"
 
     @property
     def candidates(self) -> Candidates:
         """The candidates with the poses that were tried."""
-        return Candidates(self.approach, self.contact, poses_along(*self.pairs.unbind(dim=1)))
+        return Candidates(
+            self.approach, self.contact, poses_along(*self.pairs.unbind(dim=1), hand=HANDS[self.gripper].gripper)
+        )
 
     @property
     def success(self) -> torch.Tensor:
@@ -96,6 +101,7 @@ def save_scene(
             "sides": cloud.sides.tolist(),
             "T_cloud_canonical": cloud.T_cloud_canonical.matrix.tolist(),
             "scene": view.scene,
+            "gripper": view.gripper,
         }
         arrays |= {
             f"{number}/frame": np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8),
@@ -169,6 +175,7 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
         outcomes=tensor("outcomes", torch.uint8),
         collision_free=tensor("collision_free", torch.bool),
         scene=frame["scene"],
+        gripper=frame.get("gripper", "franka"),
     )
 
 

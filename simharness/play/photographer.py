@@ -104,6 +104,7 @@ def attempt_pictures(event: Attempted) -> dict[str, bytes]:
         event.record.width,
         colour,
         event.before.view.viewpoints[0],
+        event.before.gripper,
     )
     segmentation = segmentation_colours(images.segmentation, event.before.objects)
     part = close_up(images.segmentation, event.before.objects)

@@ -13,7 +13,7 @@ from jaxtyping import Bool, Float, Float32, Float64, Int32, UInt8
 from PIL import Image, ImageDraw
 
 from simharness.sim.scene import TABLE_HEIGHT, WORKSPACE
-from tesnet.geometry import PANDA, CameraIntrinsics, Pose
+from tesnet.geometry import PANDA, CameraIntrinsics, Gripper, Pose
 
 PICTURE_SIZE = (480, 360)
 """Width and height of a stored picture, pixels."""
@@ -143,12 +143,14 @@ def point_colours(
     return colours
 
 
-def hand_lines(T_world_grasp: Float[np.ndarray, "4 4"], width: float) -> Float64[np.ndarray, "lines 2 3"]:
+def hand_lines(
+    T_world_grasp: Float[np.ndarray, "4 4"], width: float, hand: Gripper = PANDA
+) -> Float64[np.ndarray, "lines 2 3"]:
     """The usual drawing of a two-finger hand: line segments (4, 2, 3) in the world, metres.
 
     Two fingers at the opening `width`, the bar that joins them, and the wrist.
     """
-    left, right, palm = PANDA.parts
+    left, right, palm = hand.parts
     (inner, _), (other, _) = (finger.span(0.0, width) for finger in (left, right))
     segments = np.array(
         [
@@ -169,6 +171,7 @@ def cloud_picture(
     width: float,
     hand_colour: tuple[int, int, int],
     viewpoint: Float[np.ndarray, 3],
+    hand: Gripper = PANDA,
 ) -> Image.Image:
     """The cloud over the table and a hand, seen from the camera's side but turned so that the hand's plane is broad.
 
@@ -181,9 +184,10 @@ def cloud_picture(
         width: opening, metres.
         hand_colour: red, green, blue.
         viewpoint: the camera's position in the world, metres.
+        hand: which hand.
     """
     T_world_view = _cloud_view(np.asarray(T_world_grasp), np.asarray(viewpoint))
-    lines = hand_lines(T_world_grasp, width)
+    lines = hand_lines(T_world_grasp, width, hand)
     view = _fitted(np.concatenate([points_world, lines.reshape(-1, 3)]), T_world_view)
     canvas = _table(T_world_view, view)
     depths = _splat(canvas, points_world, colours, T_world_view, view)

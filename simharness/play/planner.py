@@ -23,6 +23,7 @@ from tesnet.query import GraspQuery
 if TYPE_CHECKING:
     from typing_extensions import Self
 
+DEFAULT_HAND = "franka"
 REQUEST_TIMEOUT_S = 60.0
 
 
@@ -33,13 +34,21 @@ class HttpPlanner:
         url: where the service is.
         model: the network to ask for.
         max_grasps: grasps wanted for each observation.
+        gripper: name of the hand to ask for.
         transport: replaces the network, for tests.
 
     Raises:
         UsageError: a URL that is not http or https.
     """
 
-    def __init__(self, url: str, model: str, max_grasps: int, transport: httpx.BaseTransport | None = None) -> None:
+    def __init__(
+        self,
+        url: str,
+        model: str,
+        max_grasps: int,
+        gripper: str = DEFAULT_HAND,
+        transport: httpx.BaseTransport | None = None,
+    ) -> None:
         try:
             self._client = GraspClient(url, timeout=REQUEST_TIMEOUT_S, transport=transport)
         except GraspClientError as error:
@@ -47,6 +56,7 @@ class HttpPlanner:
         self._url = url
         self._model = model
         self._max_grasps = max_grasps
+        self._gripper = None if gripper == DEFAULT_HAND else gripper  # older services know no hand by name
 
     def __enter__(self) -> Self:
         return self
@@ -72,7 +82,11 @@ class HttpPlanner:
         options = _options(query_about(observation, seed))
         try:
             reply = self._client.grasps(
-                observation.points_world, **options, max_grasps=self._max_grasps, model=self._model
+                observation.points_world,
+                **options,
+                max_grasps=self._max_grasps,
+                model=self._model,
+                gripper=self._gripper,
             )
         except GraspClientError as error:
             raise RunBroken(f"the service at {self._url} gave no answer: {error}") from error

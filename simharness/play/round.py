@@ -28,8 +28,9 @@ from simharness.sim.camera import PRESET_NOISE, Noise, Observation, observe
 from simharness.sim.execute import Outcome, attempt
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel
-from simharness.sim.scene import make_scene
+from simharness.sim.scene import make_scene, scales_for
 from simharness.sim.world import World
+from tesnet.geometry import PANDA, Gripper
 
 _SCENE_STREAM, _CAMERA_STREAM, _REQUEST_STREAM = range(3)
 
@@ -103,6 +104,7 @@ class Observed:
         view: what the camera saw.
         plan: what the planner proposes.
         objects: ids and names of the bodies on the table.
+        gripper: the hand.
     """
 
     seed: int
@@ -111,6 +113,7 @@ class Observed:
     view: Observation
     plan: Plan
     objects: Mapping[int, str]
+    gripper: Gripper = PANDA
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -184,7 +187,14 @@ def play_round(
         RunBroken: the planner failed.
     """
     with World() as world:
-        scene = make_scene(world, settings.scene, objects, scene_rng(seed, round_number), num_objects=OBJECTS_PER_ROUND)
+        scene = make_scene(
+            world,
+            settings.scene,
+            objects,
+            scene_rng(seed, round_number),
+            num_objects=OBJECTS_PER_ROUND,
+            scale_range=scales_for(settings.scene, settings.hand.gripper),
+        )
         names = {placed.body_id: placed.name for placed in scene.placed}
         present = tuple(names[body] for body in world.objects)
         table = _Table(settings, world, names, seed, round_number, listener, segmentation=segmentation)
@@ -208,7 +218,7 @@ class _Table:
     ) -> None:
         self._settings = settings
         self._world = world
-        self._hand = Hand(world)
+        self._hand = Hand(world, settings.hand)
         self._names = names
         self._seed = seed
         self._round = round_number
@@ -250,7 +260,7 @@ class _Table:
         )
         plan = planner.plan(view, request_seed(self._seed, self._round, observation))
         present = {body: self._names[body] for body in self._world.objects}
-        observed = Observed(self._seed, self._round, observation, view, plan, present)
+        observed = Observed(self._seed, self._round, observation, view, plan, present, self._hand.gripper)
         self._tell(observed)
         return observed
 

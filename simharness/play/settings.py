@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from simharness.sim.camera import Preset
 from simharness.sim.execute import Executor
 from simharness.sim.objects import SceneKind
+from tesnet.hands import HANDS, KnownHand
 
 Part = Literal["round", "model", "camera"]
 
@@ -50,6 +51,7 @@ class Flag:
         default: what holds when nothing is said.
         least: the smallest whole number that can be asked for.
         within: the numbers that can be asked for.
+        choices: the words that can be asked for.
     """
 
     part: Part
@@ -58,6 +60,7 @@ class Flag:
     default: Any = None
     least: int | None = None
     within: Interval | None = None
+    choices: tuple[str, ...] | None = None
 
 
 _NOISE = Interval(0, 1, "metres", from_low=True)
@@ -143,6 +146,21 @@ class RunSettings:
             within=Interval(0, 1, "metres"),
         ),
     ] = None
+
+    gripper: Annotated[
+        str,
+        Flag(
+            "round",
+            "the hand; objects are scaled by its opening",
+            default="franka",
+            choices=tuple(HANDS),
+        ),
+    ] = "franka"
+
+    @property
+    def hand(self) -> KnownHand:
+        """The hand that `gripper` names."""
+        return HANDS[self.gripper]
 
     def to_json(self) -> dict[str, Any]:
         """The settings as JSON values."""

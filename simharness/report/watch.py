@@ -126,10 +126,11 @@ class Watcher:
                 precision="float32",
             )
             others = [
-                hand_lines(plan.Ts_world_grasp[index], float(plan.widths[index])) for index in range(1, len(plan))
+                hand_lines(plan.Ts_world_grasp[index], float(plan.widths[index]), event.gripper)
+                for index in range(1, len(plan))
             ]
             self._hands("/grasps", others, OTHER_COLOUR, _LINE_WIDTH)
-            best = [hand_lines(plan.Ts_world_grasp[0], float(plan.widths[0]))] if len(plan) else []
+            best = [hand_lines(plan.Ts_world_grasp[0], float(plan.widths[0]), event.gripper)] if len(plan) else []
             self._hands("/executed", best, _EXECUTED_COLOUR, _EXECUTED_LINE_WIDTH)
 
     def _attempted(self, event: Attempted) -> None:
@@ -139,7 +140,12 @@ class Watcher:
             self._status.content = (
                 f"Seed {record.seed}, round {record.round}, attempt {record.attempt}: **{record.outcome}**"
             )
-            self._hands("/executed", [hand_lines(record.T_world_grasp, record.width)], colour, _EXECUTED_LINE_WIDTH)
+            self._hands(
+                "/executed",
+                [hand_lines(record.T_world_grasp, record.width, event.before.gripper)],
+                colour,
+                _EXECUTED_LINE_WIDTH,
+            )
 
     def _hands(self, name: str, hands: list[Any], colour: tuple[int, int, int], thickness: float) -> None:
         segments = np.concatenate(hands).astype(np.float32) if hands else np.zeros((1, 2, 3), dtype=np.float32)

@@ -9,10 +9,11 @@ import numpy as np
 
 from simharness.sim.camera import Observation
 from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT
+from tesnet.geometry import PANDA, Gripper
 from tesnet.query import GraspQuery
 
 
-def query_about(observation: Observation, seed: int = 0) -> GraspQuery:
+def query_about(observation: Observation, seed: int = 0, gripper: Gripper = PANDA) -> GraspQuery:
     """The cloud of an observation with all that the protocol tells of it; nothing else is changed from the defaults."""
     return GraspQuery(
         observation.points_world,
@@ -20,5 +21,6 @@ def query_about(observation: Observation, seed: int = 0) -> GraspQuery:
         up=np.array([0.0, 0.0, 1.0]),
         workspace=PERCEPTION_BOX,
         support_height=TABLE_HEIGHT,
+        gripper=gripper,
         seed=seed,
     )

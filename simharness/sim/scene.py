@@ -14,7 +14,7 @@ import numpy as np
 
 from simharness.sim.objects import ObjectModel, SceneKind
 from simharness.sim.world import TIMESTEP, World
-from tesnet.geometry import Box, Pose
+from tesnet.geometry import PANDA, Box, Gripper, Pose
 
 TABLE_HEIGHT = 0.05
 WORKSPACE = Box(np.array([0.0, 0.0, 0.0]), np.array([0.3, 0.3, 0.3]))
@@ -29,6 +29,9 @@ SETTLING_LIMIT = 2.0
 _STEPS_BETWEEN_CHECKS = 60
 
 SCALE_RANGES: Mapping[SceneKind, tuple[float, float]] = {"packed": (0.7, 0.8), "pile": (0.8, 1.0)}
+
+LARGEST_FACTOR = 1.25
+"""Objects are scaled by a hand's opening in terms of the Panda's, up to this."""
 
 _PACKED_TRIES = 12
 _PACKED_RANGE = (0.08, 0.22)
@@ -74,6 +77,13 @@ class Scene:
     kind: SceneKind
     placed: tuple[PlacedObject, ...]
     lost: tuple[str, ...] = ()
+
+
+def scales_for(kind: SceneKind, hand: Gripper) -> tuple[float, float]:
+    """Limits of the uniform scale for a hand: the protocol's, which are the Panda's, times how much wider it opens."""
+    factor = min(hand.max_width / PANDA.max_width, LARGEST_FACTOR)
+    low, high = SCALE_RANGES[kind]
+    return factor * low, factor * high
 
 
 def make_scene(

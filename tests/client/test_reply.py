@@ -25,7 +25,7 @@ def _answer(document: object, status: int = 200) -> Answer:
 
 def test_the_hand_that_answered_is_a_gripper_and_older_services_say_none(found: dict[str, Any]) -> None:
     hand = HANDS["rg2"].gripper.with_sizes({"max_width": 0.05})
-    told = {"name": "mine", **hand.sizes(), "parts": []}
+    told: dict[str, Any] = {"name": "mine", **hand.sizes(), "parts": []}
     reply = grasp_reply(_answer({**found, "gripper": told}))
     assert reply.gripper == hand
     assert reply.gripper.name == "mine"
