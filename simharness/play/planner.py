@@ -34,8 +34,8 @@ class HttpPlanner:
         url: where the service is.
         model: the network to ask for.
         max_grasps: grasps wanted for each observation.
-        gripper: name of the hand to ask for.
         transport: replaces the network, for tests.
+        gripper: name of the hand to ask for.
 
     Raises:
         UsageError: a URL that is not http or https.
@@ -46,8 +46,9 @@ class HttpPlanner:
         url: str,
         model: str,
         max_grasps: int,
-        gripper: str = DEFAULT_HAND,
         transport: httpx.BaseTransport | None = None,
+        *,
+        gripper: str = DEFAULT_HAND,
     ) -> None:
         try:
             self._client = GraspClient(url, timeout=REQUEST_TIMEOUT_S, transport=transport)
@@ -56,7 +57,8 @@ class HttpPlanner:
         self._url = url
         self._model = model
         self._max_grasps = max_grasps
-        self._gripper = None if gripper == DEFAULT_HAND else gripper  # older services know no hand by name
+        # Older services know no hand by name.
+        self._hand: dict[str, Any] = {} if gripper == DEFAULT_HAND else {"gripper": gripper}
 
     def __enter__(self) -> Self:
         return self
@@ -79,14 +81,13 @@ class HttpPlanner:
         if not len(observation.points_world):
             return Plan.nothing("no_points_in_workspace")
         start = time.perf_counter()
-        options = _options(query_about(observation, seed))
+        options = _options(query_about(observation, seed)) | self._hand
         try:
             reply = self._client.grasps(
                 observation.points_world,
                 **options,
                 max_grasps=self._max_grasps,
                 model=self._model,
-                gripper=self._gripper,
             )
         except GraspClientError as error:
             raise RunBroken(f"the service at {self._url} gave no answer: {error}") from error

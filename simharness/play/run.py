@@ -170,7 +170,7 @@ def _play(
     with ExitStack() as stack:
         service = stack.enter_context(LocalService(settings.model, log.service_log)) if url is None else None
         address = service.url if service is not None else str(url)
-        with HttpPlanner(address, settings.model, settings.max_grasps, settings.gripper) as planner:
+        with HttpPlanner(address, settings.model, settings.max_grasps, gripper=settings.gripper) as planner:
             model, document = planner.model()
         log.open(model, Serving(url, NUM_THREADS if service is not None else None, document.get("device")))
         # On a cluster nobody reaches this machine's service, so workers there have their own.
@@ -212,7 +212,9 @@ class _Rounds:
         photographer = Photographer(self.settings)
         with ExitStack() as stack:
             planner = stack.enter_context(
-                HttpPlanner(self._service(stack), self.settings.model, self.settings.max_grasps, self.settings.gripper)
+                HttpPlanner(
+                    self._service(stack), self.settings.model, self.settings.max_grasps, gripper=self.settings.gripper
+                )
             )
             self._check(planner)
 

@@ -8,6 +8,8 @@ import numpy as np
 import pytest
 
 from simharness.sim.outcomes import OUTCOME_KINDS
+from tesnet.hands import HANDS
+from training.archive import pack
 from training.generate import GenerateConfig, generate
 from training.views import LabelsError, load_scene, scene_files
 
@@ -80,3 +82,19 @@ def test_a_folder_of_labels_is_not_taken_over_unasked(labels: Path) -> None:
 def test_a_folder_of_other_settings_is_refused(labels: Path) -> None:
     with pytest.raises(LabelsError, match=r"other settings \(seed: 5\)"):
         generate(replace(CONFIG, seed=6), 1, 1, labels, resume=True)
+
+
+def test_labels_of_another_hand_say_so_and_keep_its_poses(tmp_path: Path) -> None:
+    generate(replace(CONFIG, gripper="rg2", scene="pile", labels_per_view=4), 1, 1, tmp_path)
+    views = [view for path in scene_files([tmp_path]) for view in load_scene(path)[1]]
+    assert {view.gripper for view in views} == {"rg2"}
+    view = next(view for view in views if len(view.outcomes))
+    hand = HANDS["rg2"].gripper
+    p_a, p_c, closing, travel = view.pairs.double().unbind(dim=1)
+    d = p_c - p_a
+    closed = 2 * (d * closing).sum(dim=1).clamp(0, hand.max_width / 2)
+    tips = (d * travel).sum(dim=1) + 0.007  # past the approach point, once the hand has closed
+    expected = p_a + (tips - hand.tip_offset - hand.tcp_at(closed) + hand.hand_to_tcp)[:, None] * travel
+    np.testing.assert_allclose(view.candidates.Ts_canonical_grasp[:, :3, 3], expected, atol=1e-5)
+    with pytest.raises(LabelsError, match="labels of rg2; an archive keeps those of franka alone"):
+        pack([tmp_path], tmp_path / "archive")

@@ -83,6 +83,21 @@ def test_the_request_carries_what_the_protocol_says() -> None:
     np.testing.assert_array_equal(np.frombuffer(seen[0].content, "<f4").reshape(-1, 3), view.points_world)
 
 
+def test_another_hand_is_asked_for_by_name() -> None:
+    seen: list[httpx.Request] = []
+
+    def reply(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer(1))
+
+    for gripper in ("franka", "rg2"):
+        with HttpPlanner("http://service.test", "tesnet", 1, httpx.MockTransport(reply), gripper=gripper) as asked:
+            asked.plan(observation(), seed=1)
+    franka, rg2 = (parse_qs(request.url.query.decode()) for request in seen)
+    assert "gripper" not in franka  # older services know the default hand alone
+    assert json.loads(rg2["gripper"][0]) == "rg2"
+
+
 def test_every_viewpoint_of_a_fused_cloud_is_sent() -> None:
     seen: list[httpx.Request] = []
 

@@ -18,9 +18,11 @@ from simharness.sim.scene import (
     describe,
     make_scene,
     restore_scene,
+    scales_for,
     settle,
 )
 from simharness.sim.world import TIMESTEP, World, data_path
+from tesnet.hands import HANDS
 
 pytestmark = pytest.mark.sim
 
@@ -167,3 +169,14 @@ def test_what_never_rests_is_waited_for_as_long_as_the_limit_says(monkeypatch: p
         monkeypatch.setattr(World, "speed", lambda _world, _body: 0.5 * RESTING_SPEED)
         settle(world, limit=1.0)
         assert sum(steps) * TIMESTEP < 0.5
+
+
+@pytest.mark.parametrize(
+    ("name", "factor"), [("franka", 1.0), ("hand_e", 0.625), ("robotiq_2f85", 1.0625), ("robotiq_2f140", 1.25)]
+)
+@pytest.mark.parametrize("kind", SCALE_RANGES)
+def test_objects_are_scaled_by_a_hands_opening(kind: SceneKind, name: str, factor: float) -> None:
+    found, protocol = scales_for(kind, HANDS[name].gripper), SCALE_RANGES[kind]
+    assert found == pytest.approx(tuple(factor * limit for limit in protocol))
+    if name == "franka":
+        assert found == protocol
