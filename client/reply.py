@@ -100,7 +100,7 @@ class ModelIdentity:
 
     name: str
     version: str
-    weights_sha256: str
+    weights_sha256: str | None
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -130,7 +130,7 @@ class GraspOptions(TypedDict, total=False):
         pregrasp_distance: how far behind the grasp `pregrasp` lies (default 0.05).
         frame_convention: `"panda"` (default), `"graspnet"` or `"contact_graspnet"`.
         seed: makes sampling repeatable (default 0).
-        model: one of the networks that the service has loaded (default `"tesnet"`).
+        model: one of the networks that the service has loaded (default: the first that `/model` lists).
     """
 
     viewpoint: Vector | Sequence[Vector]

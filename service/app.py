@@ -156,7 +156,6 @@ def create_app(
 
 
 def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResponse:
-    info = worker.model
     return schemas.ModelResponse(
         models=[
             schemas.NetworkOut(
@@ -166,6 +165,7 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
                 card=msgspec.to_builtins(info.card),
                 configuration=msgspec.to_builtins(info.configuration),
             )
+            for info in worker.models
         ],
         gripper=schemas.GripperOut(**described(PANDA)),
         hands=[schemas.HandOut(**described_known(hand)) for hand in HANDS.values()],

@@ -33,11 +33,11 @@ State = Literal["loading", "ready", "failed", "stopped"]
 
 
 class Predictor(Protocol):
-    """What the service needs of `tesnet.predictor.GraspPredictor`."""
+    """What the service needs of `tesnet.several.GraspPredictors`."""
 
     @property
-    def model(self) -> ModelInfo:
-        """Which network this is."""
+    def models(self) -> Sequence[ModelInfo]:
+        """Its networks, the default one first."""
 
     @property
     def device(self) -> object:
@@ -102,7 +102,7 @@ class PredictionWorker:
         self._costs = Costs()
         self._changed = threading.Condition()
         self._state: State = "loading"
-        self._model: ModelInfo | None = None
+        self._models: Sequence[ModelInfo] = ()
         self._device = ""
         self._running: list[_Running] = []  # the last one interrupts the one before it
         self._thread = threading.Thread(target=self._run, name="predictor", daemon=True)
@@ -113,19 +113,19 @@ class PredictionWorker:
         return self._state
 
     @property
-    def model(self) -> ModelInfo:
-        """The loaded network.
+    def models(self) -> Sequence[ModelInfo]:
+        """The loaded networks, the default one first.
 
         Raises:
-            NotReady: while it is being loaded.
+            NotReady: while they are being loaded.
         """
-        if self._model is None:
+        if not self._models:
             raise NotReady("The weights are being loaded; come back in a moment.", retry_after=1)
-        return self._model
+        return self._models
 
     @property
     def device(self) -> str:
-        """Where the loaded network computes."""
+        """Where the loaded networks compute."""
         return self._device
 
     @property
@@ -273,7 +273,7 @@ class PredictionWorker:
             predictor = self._factory()
             predictor.warm_up()
             self._device = str(predictor.device)
-            self._model = predictor.model
+            self._models = predictor.models
         except BaseException as error:  # noqa: BLE001 - told to the owner, whatever it is
             self._state = "failed"
             self._on_failure(error)

@@ -14,8 +14,8 @@ REMEMBERED_S = 60.0
 SAMPLES = 5
 """Of the latest predictions of a kind; their lower median is what counts, so that one stall lifts no guess."""
 
-Kind: TypeAlias = tuple[int, int]
-"""The binary orders of magnitude of a query's points, and of everything else that it costs."""
+Kind: TypeAlias = tuple[str | None, int, int]
+"""The network that a query names, and the binary orders of magnitude of its points and of all else that it costs."""
 
 Samples: TypeAlias = deque[tuple[float, float]]
 """When a prediction ended, and how many times `work` it took."""
@@ -72,7 +72,7 @@ def _options_work(query: GraspQuery) -> float:
 
 
 def _kind(query: GraspQuery) -> Kind:
-    return len(query.points).bit_length(), round(1e3 * _options_work(query)).bit_length()
+    return query.model, len(query.points).bit_length(), round(1e3 * _options_work(query)).bit_length()
 
 
 def _lower_median(samples: Sequence[tuple[float, float]] | Samples, now: float) -> float | None:

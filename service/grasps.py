@@ -10,7 +10,7 @@ import asyncio
 import math
 import re
 import time
-from collections.abc import Callable, Hashable, Iterator, Mapping
+from collections.abc import Callable, Hashable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -38,6 +38,7 @@ from service.payloads import OCTET_STREAM, build_query, decoder_for, merged, par
 from service.schemas import MAX_TIMEOUT_S, GraspOptions
 from service.settings import Settings
 from service.turns import Answer, Job
+from tesnet.geometry import PANDA
 from tesnet.query import GraspQuery
 from tesnet.result import GraspResult
 
@@ -51,6 +52,8 @@ SMALL_ANSWER = 50
 """Grasps that are encoded on the event loop: under a millisecond."""
 
 _SECONDS = re.compile(r"(\d{1,10}(\.\d{0,20})?|\.\d{1,20})([eE][+-]?\d{1,2})?")
+_ANY_HAND = "tesnet"
+"""The network that takes other hands."""
 
 Result = TypeVar("Result")
 
@@ -178,7 +181,7 @@ class GraspEndpoint:
         asked, received = await self._read(request, read)
         decoded = time.perf_counter()
         query = asked.query
-        record.fields["points"] = len(query.points)
+        record.fields.update(points=len(query.points), model=query.model or self._worker.models[0].name)
         answer = await self._predict(request, query, deadline, record.arrived + asked.timeout)
         result = answer.result
         predicted = time.perf_counter()
@@ -197,7 +200,9 @@ class GraspEndpoint:
         )
         write = partial(asked.write, result, timings)
         response = write() if len(result.grasps) <= SMALL_ANSWER else await _in_thread(self._small_lane, write)
-        self._metrics.prediction(len(query.points), timings | {"encode": 1e3 * (time.perf_counter() - predicted)})
+        self._metrics.prediction(
+            record.fields["model"], len(query.points), timings | {"encode": 1e3 * (time.perf_counter() - predicted)}
+        )
         return response
 
     async def _read(self, request: Request, read: Reader) -> tuple[Asked, float]:
@@ -234,13 +239,15 @@ class GraspEndpoint:
         def read(body: bytearray) -> Asked:
             payload = decode(body, self._settings.max_points)
             options = parse_options(merged(url_options, payload.options), self._settings.max_points)
-            check_model(options, self._worker.model)
+            model = chosen_model(options, self._worker.models)
+            query = build_query(payload, options)
+            check_hand(query, model)
 
             def write(result: GraspResult, timings_ms: Mapping[str, float]) -> Response:
-                content = encoder.encode(result, options, self._worker.model, timings_ms, request_id)
+                content = encoder.encode(result, options, model, timings_ms, request_id)
                 return Response(content, media_type=encoder.content_type, headers={"Vary": "Accept"})
 
-            return Asked(build_query(payload, options), write)
+            return Asked(query, write)
 
         return read
 
@@ -295,14 +302,29 @@ def refuse_compressed(request: Request) -> None:
         )
 
 
-def check_model(options: GraspOptions, loaded: ModelInfo) -> None:
-    """Refuse a network that is not loaded.
+def chosen_model(options: GraspOptions, loaded: Sequence[ModelInfo]) -> ModelInfo:
+    """The network that the options name, or else the first of the loaded ones.
 
     Raises:
-        Invalid: names the one that is.
+        Invalid: it is not loaded; names those that are.
     """
-    if options.model != loaded.name:
-        raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {loaded.name}")
+    if options.model is None:
+        return loaded[0]
+    for model in loaded:
+        if model.name == options.model:
+            return model
+    names = ", ".join(model.name for model in loaded)
+    raise Invalid("model", f"is {shortened(options.model)}, which is not loaded; loaded: {names}")
+
+
+def check_hand(query: GraspQuery, model: ModelInfo) -> None:
+    """Refuse another hand than the Panda's for a network that knows no other.
+
+    Raises:
+        Invalid: names the network that does.
+    """
+    if query.gripper != PANDA and model.name != _ANY_HAND:
+        raise Invalid("gripper", f"is another hand, but {model.name} knows the Panda hand alone; ask {_ANY_HAND}")
 
 
 def _retrieve(answer: asyncio.Future[Answer]) -> None:

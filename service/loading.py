@@ -1,4 +1,4 @@
-"""How a process that serves gets its predictor: from the settings, in the thread that will own it."""
+"""How a process that serves gets its predictors: from the settings, in the thread that will own them."""
 
 from __future__ import annotations
 
@@ -6,17 +6,34 @@ from typing import TYPE_CHECKING
 
 if TYPE_CHECKING:
     from service.batching import Predictor, PredictorFactory
-    from service.settings import Settings
+    from service.settings import NetworkName, Settings
+    from tesnet.predictor import GraspPredictor
 
 
 def predictor_factory(settings: Settings) -> PredictorFactory:
-    """Loads the network that the settings name, when it is called; torch is loaded then and not before."""
+    """Loads the networks that the settings name, when it is called; torch is loaded then and not before.
+
+    What it makes raises `WeightsError` for weights that are missing, damaged or another network's.
+    """
 
     def make() -> Predictor:
-        from tesnet.predictor import GraspPredictor  # noqa: PLC0415 - loads torch, while the port answers already
-        from tesnet.weights import default_weights  # noqa: PLC0415 - the same
+        from tesnet.several import GraspPredictors  # noqa: PLC0415 - loads torch, while the port answers already
 
-        weights = settings.weights or default_weights(settings.models)
-        return GraspPredictor.load(weights, device=settings.device, num_threads=settings.num_threads)
+        return GraspPredictors([_load(name, settings) for name in settings.models])
 
     return make
+
+
+def _load(name: NetworkName, settings: Settings) -> GraspPredictor:
+    from tesnet.errors import WeightsError  # noqa: PLC0415 - in `make` torch is wanted
+    from tesnet.networks import is_weightless  # noqa: PLC0415 - the same
+    from tesnet.predictor import GraspPredictor  # noqa: PLC0415 - the same
+    from tesnet.weights import default_weights  # noqa: PLC0415 - the same
+
+    if is_weightless(name):
+        return GraspPredictor.without_weights(name, settings.device, settings.num_threads)
+    path = settings.weights.get(name) or default_weights(name)
+    predictor = GraspPredictor.load(path, settings.device, settings.num_threads)
+    if predictor.model.name != name:
+        raise WeightsError(path, f"holds {predictor.model.name}, not {name}; name it so in GRASP_MODELS")
+    return predictor

@@ -47,6 +47,9 @@ class Metrics:
             buckets=SECONDS,
             registry=self._registry,
         )
+        self._predictions = Counter(
+            "grasp_predictions", "Requests answered by each network.", ("model",), registry=self._registry
+        )
         self._points = Histogram("grasp_points", "Points in a request.", buckets=POINTS, registry=self._registry)
         self._batches = Histogram(
             "grasp_batch_size", "Clouds predicted together.", buckets=BATCHES, registry=self._registry
@@ -80,8 +83,9 @@ class Metrics:
         self._requests.labels(method, route, str(status)).inc()
         self._duration.labels(route).observe(seconds)
 
-    def prediction(self, points: int, timings_ms: Mapping[str, float]) -> None:
-        """Record a prediction's size and stages (milliseconds)."""
+    def prediction(self, model: str, points: int, timings_ms: Mapping[str, float]) -> None:
+        """Record a prediction's network, size and stages (milliseconds)."""
+        self._predictions.labels(model).inc()
         self._points.observe(points)
         for stage, milliseconds in timings_ms.items():
             self._stages.labels(stage).observe(milliseconds / 1e3)

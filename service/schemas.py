@@ -216,7 +216,9 @@ class GraspOptions(RequestPart):
         description="Axes and origin of `position`, `quaternion_xyzw`, `matrix`: panda, graspnet or contact_graspnet.",
     )
     seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Makes sampling repeatable, 0 to 2^63 - 1.")
-    model: str = Field(default="tesnet", max_length=64, description="One of the networks that `GET /model` lists.")
+    model: str | None = Field(
+        default=None, max_length=64, description="One of the networks that `GET /model` lists. Default: the first."
+    )
 
 
 class GraspRequest(GraspOptions):
@@ -287,7 +289,9 @@ class ModelIdentity(ResponsePart):
 
     name: str = Field(description="Name of the network.")
     version: str = Field(description="Version of its weights.")
-    weights_sha256: str = Field(description="SHA-256 of the weights file, in hexadecimal.")
+    weights_sha256: str | None = Field(
+        description="SHA-256 of the weights file, in hexadecimal; null for a network without weights."
+    )
 
 
 class RejectedOut(ResponsePart):

@@ -13,13 +13,19 @@ import re
 from collections.abc import Mapping
 from importlib.metadata import PackageNotFoundError, version
 from pathlib import Path
-from typing import Literal
+from typing import Literal, get_args
 
-from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, field_validator
+from pydantic import BaseModel, ConfigDict, Field, SecretStr, ValidationError, ValidationInfo, field_validator
 
 from service.schemas import MAX_TIMEOUT_S
 
 PREFIX = "GRASP_"
+NetworkName = Literal[
+    "tesnet", "tesnet-paper", "tesnet-euclidean", "gatv2", "edgegrasp", "pointnetgpd", "gpd", "heuristic"
+]
+NETWORK_NAMES = get_args(NetworkName)
+"""Those of `tesnet.networks`, which loads torch."""
+
 MAX_THREADS = 8
 """More threads than this do not make one cloud of usual size any faster."""
 
@@ -66,9 +72,16 @@ class Settings(BaseModel):
         default="127.0.0.1", min_length=1, description="Address to listen on; 0.0.0.0 for every interface."
     )
     port: int = Field(default=8000, ge=0, le=65535, description="TCP port, 0 to 65535; 0 picks a free one.")
-    models: Literal["tesnet"] = Field(default="tesnet", description="Networks to load; this version has tesnet.")
-    weights: Path | None = Field(
-        default=None, description="Weights file (.safetensors). Default: the one that is installed with the package."
+    models: tuple[NetworkName, ...] = Field(
+        default_factory=lambda: ("tesnet",),
+        min_length=1,
+        description=f"Networks to load, separated by commas, of {', '.join(NETWORK_NAMES)}; the first answers requests "
+        "without `model`. Default: tesnet.",
+    )
+    weights: Mapping[NetworkName, Path] = Field(
+        default_factory=dict,
+        description="Weights file (.safetensors) of the only network, or NAME=PATH for each, separated by commas. "
+        "Default: the files that are installed with the package.",
     )
     device: str = Field(
         default="auto", pattern=r"^(auto|cpu|cuda(:\d+)?)$", description="Compute device: auto, cpu, cuda or cuda:N."
@@ -139,10 +152,42 @@ class Settings(BaseModel):
         default="info", description="Least level of a log line: debug, info, warning or error."
     )
 
-    @field_validator("log_level", "device", "models", mode="before")
+    @field_validator("log_level", "device", mode="before")
     @classmethod
     def _lower_case(cls, value: object) -> object:
         return value.strip().lower() if isinstance(value, str) else value
+
+    @field_validator("models", mode="before")
+    @classmethod
+    def _names(cls, value: object) -> object:
+        return [part.strip().lower() for part in value.split(",")] if isinstance(value, str) else value
+
+    @field_validator("models")
+    @classmethod
+    def _once(cls, names: tuple[NetworkName, ...]) -> tuple[NetworkName, ...]:
+        if len(set(names)) < len(names):
+            raise ValueError("a network twice")
+        return names
+
+    @field_validator("weights", mode="before")
+    @classmethod
+    def _by_network(cls, value: object, info: ValidationInfo) -> object:
+        """A path alone is that of the only network."""
+        models = info.data.get("models", ())
+        if isinstance(value, str | Path) and not _names_network(str(value)):
+            if len(models) > 1:
+                raise ValueError("whose weights?")
+            return dict.fromkeys(models, value)
+        if isinstance(value, str):
+            return dict(_named_path(part) for part in value.split(","))
+        return value
+
+    @field_validator("weights")
+    @classmethod
+    def _of_loaded(cls, paths: Mapping[NetworkName, Path], info: ValidationInfo) -> Mapping[NetworkName, Path]:
+        if not paths.keys() <= set(info.data.get("models", ())):
+            raise ValueError("weights of a network that is not loaded")
+        return paths
 
     @field_validator("api_keys", "cors_origins", "trusted_proxies", mode="before")
     @classmethod
@@ -186,6 +231,17 @@ class Settings(BaseModel):
     def max_body_bytes(self) -> int:
         """Bytes in a request's body."""
         return int(self.max_body_mb * 2**20)
+
+
+def _names_network(text: str) -> bool:
+    return text.partition("=")[0].strip().lower() in NETWORK_NAMES
+
+
+def _named_path(text: str) -> tuple[str, str]:
+    name, _, path = text.partition("=")
+    if not path.strip():
+        raise ValueError("no path")
+    return name.strip().lower(), path.strip()
 
 
 def load_settings(environment: Mapping[str, str]) -> Settings:

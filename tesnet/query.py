@@ -48,6 +48,7 @@ class GraspQuery:
         gripper: the hand, which opens no wider than `WIDEST`.
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
         seed: makes sampling repeatable.
+        model: the network that shall answer, where several are loaded; None for the first of them.
 
     Raises:
         InvalidQuery: names the field and gives the value, the limit and the remedy.
@@ -69,6 +70,7 @@ class GraspQuery:
     gripper: Gripper = PANDA
     unseen: Literal["free", "occupied"] = "free"
     seed: int = 0
+    model: str | None = None
 
     @property
     def nbytes(self) -> int:

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable, Mapping
+from typing import TYPE_CHECKING
 
 from fastapi import APIRouter, Depends, Request, Response
 
@@ -19,7 +20,7 @@ from service.errors import (
     UnknownModel,
     shortened,
 )
-from service.grasps import Asked, GraspEndpoint, Reader, check_model, refuse_compressed
+from service.grasps import Asked, GraspEndpoint, Reader, check_hand, chosen_model, refuse_compressed
 from service.inference_protocol.decoding import decode
 from service.inference_protocol.documentation import INFER_PROBLEMS, INFER_REQUEST, INFER_RESPONSES
 from service.inference_protocol.encoding import encode
@@ -28,6 +29,9 @@ from service.openapi import problems
 from service.payloads import JSON, OCTET_STREAM, build_query, media_type
 from service.settings import Settings, service_version
 from tesnet.result import GraspResult
+
+if TYPE_CHECKING:
+    from tesnet.predictor import ModelInfo
 
 
 def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: GraspEndpoint) -> APIRouter:
@@ -41,11 +45,13 @@ def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: G
     router = APIRouter(prefix=INFERENCE_PROTOCOL, tags=["inference protocol"])
     model_problems = problems(NotReady, Unauthorized, UnknownModel)
 
-    def check_path(model: str, version: str | None) -> None:
-        loaded = worker.model
-        if model != loaded.name or version not in (None, loaded.version):
-            what = shortened(model if version is None else f"{model}, version {version}")
-            raise UnknownModel(f"{what} is not loaded; loaded: {loaded.name}, version {loaded.version}.")
+    def of_path(model: str, version: str | None) -> ModelInfo:
+        for loaded in worker.models:
+            if model == loaded.name and version in (None, loaded.version):
+                return loaded
+        what = shortened(model if version is None else f"{model}, version {version}")
+        names = "; ".join(f"{loaded.name}, version {loaded.version}" for loaded in worker.models)
+        raise UnknownModel(f"{what} is not loaded; loaded: {names}.")
 
     @router.get("", summary="Server metadata", responses=problems(Unauthorized))
     async def server() -> schemas.ServerMetadata:
@@ -66,14 +72,14 @@ def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: G
     def add_model(path: str, version_of: Callable[..., str | None]) -> None:
         @router.get(path, summary="Model metadata", responses=model_problems)
         async def describe(model: str, version: str | None = Depends(version_of)) -> schemas.ModelMetadata:
-            check_path(model, version)
+            loaded = of_path(model, version)
             return schemas.ModelMetadata(
-                name=model, versions=[worker.model.version], platform="pytorch", inputs=[INPUT], outputs=OUTPUTS
+                name=model, versions=[loaded.version], platform="pytorch", inputs=[INPUT], outputs=OUTPUTS
             )
 
         @router.get(f"{path}/ready", summary="Does the model take requests?", responses=model_problems)
         async def model_ready(model: str, version: str | None = Depends(version_of)) -> dict[str, bool]:
-            check_path(model, version)
+            of_path(model, version)
             endpoint.check_ready()
             return {"ready": True}
 
@@ -86,8 +92,7 @@ def inference_protocol(settings: Settings, worker: PredictionWorker, endpoint: G
         )
         async def infer(request: Request, model: str, version: str | None = Depends(version_of)) -> Response:
             def reader_of(request: Request) -> Reader:
-                check_path(model, version)
-                return _reader(request, settings, worker)
+                return _reader(request, settings, of_path(model, version))
 
             return await endpoint.answer(request, reader_of)
 
@@ -105,7 +110,7 @@ def _version_of_path(version: str) -> str:
     return version
 
 
-def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> Reader:
+def _reader(request: Request, settings: Settings, model: ModelInfo) -> Reader:
     """Reads the bodies of `infer`, once the head of the request is known to be right."""
     refuse_compressed(request)
     given = request.headers.get("content-type", JSON)  # which Triton's client leaves out
@@ -120,14 +125,16 @@ def _reader(request: Request, settings: Settings, worker: PredictionWorker) -> R
 
     def read(body: bytearray) -> Asked:
         asked = decode(body, None if head_length is None else int(head_length), settings.max_points)
-        check_model(asked.options, worker.model)
+        options = asked.options.model_copy(update={"model": chosen_model(asked.options, [model]).name})
+        query = build_query(asked.payload, options)
+        check_hand(query, model)
 
         def write(result: GraspResult, timings_ms: Mapping[str, float]) -> Response:
-            arrays = answer_arrays(result, asked.options)
-            meta = answer_meta(result, worker.model, timings_ms, request_id)
-            head = {"model_name": worker.model.name, "model_version": worker.model.version}
+            arrays = answer_arrays(result, options)
+            meta = answer_meta(result, model, timings_ms, request_id)
+            head = {"model_name": model.name, "model_version": model.version}
             return encode(head | ({"id": asked.identity} if asked.identity else {}), arrays, meta, asked.outputs)
 
-        return Asked(build_query(asked.payload, asked.options), write, asked.timeout)
+        return Asked(query, write, asked.timeout)
 
     return read

@@ -39,6 +39,7 @@ def build_query(payload: Payload, options: GraspOptions) -> GraspQuery:
         gripper=gripper_of(options.gripper),
         unseen=options.unseen,
         seed=options.seed,
+        model=options.model,
     )
 
 

@@ -33,7 +33,7 @@ class ModelRecord:
 
     name: str
     version: str
-    weights_sha256: str
+    weights_sha256: str | None
 
 
 @dataclass(frozen=True, slots=True)

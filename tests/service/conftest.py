@@ -67,8 +67,8 @@ class GatedPredictor:
     device = "cpu"
 
     @property
-    def model(self) -> Any:
-        return _Model()
+    def models(self) -> list[Any]:
+        return [_Model()]
 
     def warm_up(self) -> None:
         pass

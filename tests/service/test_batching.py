@@ -24,7 +24,7 @@ from tests.conftest import PATIENCE_S
 class Echo:
     """Answers with the thread it ran in, when its gate is open."""
 
-    model: Any = "a model"
+    models: Any = ("a model",)
     device = "cpu"
 
     def __init__(self) -> None:
@@ -179,7 +179,7 @@ class Timed:
     A query of 4,000 points asks halfway whether to go on.
     """
 
-    model: Any = "a model"
+    models: Any = ("a model",)
     device = "cpu"
     now = 0.0
 
@@ -404,7 +404,7 @@ def test_a_predictor_that_cannot_be_made_is_reported_and_nothing_is_taken(query:
 
     worker = PredictionWorker(factory, capacity=1, on_failure=on_failure)
     with pytest.raises(NotReady, match="loaded"):
-        _ = worker.model
+        _ = worker.models
     worker.start()
     assert failed.wait(PATIENCE_S)
     assert worker.state == "failed"

@@ -9,8 +9,10 @@ from pathlib import Path
 import pytest
 
 from service.loading import predictor_factory
-from service.settings import Settings
+from service.settings import Settings, load_settings
+from tesnet import networks, weights
 from tesnet.errors import WeightsError
+from tesnet.predictor import configuration_of
 from tests.conftest import PATIENCE_S
 
 
@@ -18,7 +20,7 @@ def test_the_network_and_torch_are_loaded_when_the_factory_is_called_and_not_bef
     script = (
         "import sys; from service.settings import Settings; from service.loading import predictor_factory; "
         "make = predictor_factory(Settings(device='cpu', num_threads=1)); assert 'torch' not in sys.modules; "
-        "print(make().model.name)"
+        "print(make().models[0].name)"
     )
     ran = subprocess.run([sys.executable, "-c", script], capture_output=True, text=True, timeout=PATIENCE_S, check=True)
     assert ran.stdout.strip() == "tesnet"
@@ -26,6 +28,19 @@ def test_the_network_and_torch_are_loaded_when_the_factory_is_called_and_not_bef
 
 def test_the_weights_are_those_that_the_settings_name(tmp_path: Path) -> None:
     missing = tmp_path / "none.safetensors"
-    make = predictor_factory(Settings(device="cpu", weights=missing))
+    make = predictor_factory(Settings(device="cpu", weights={"tesnet": missing}))
     with pytest.raises(WeightsError, match=r"none\.safetensors"):
         make()
+
+
+def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
+    network = networks.build("edgegrasp")
+    path = tmp_path / "mine.safetensors"
+    weights.save(path, network.state_dict(), weights.Header("edgegrasp", "3", configuration_of(network)))
+    with pytest.raises(WeightsError, match="holds edgegrasp, not tesnet; name it so in GRASP_MODELS"):
+        predictor_factory(load_settings({"GRASP_WEIGHTS": str(path), "GRASP_DEVICE": "cpu"}))()
+    settings = load_settings(
+        {"GRASP_MODELS": "heuristic,edgegrasp", "GRASP_WEIGHTS": f"edgegrasp={path}", "GRASP_DEVICE": "cpu"}
+    )
+    made = predictor_factory(settings)()
+    assert [(model.name, model.version) for model in made.models] == [("heuristic", "1"), ("edgegrasp", "3")]

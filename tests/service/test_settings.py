@@ -6,7 +6,8 @@ from pathlib import Path
 
 import pytest
 
-from service.settings import InvalidSetting, cpu_quota, load_settings, unknown_variables
+from service.settings import NETWORK_NAMES, InvalidSetting, cpu_quota, load_settings, unknown_variables
+from tesnet import networks
 
 
 def test_an_empty_environment_gives_the_documented_defaults() -> None:
@@ -29,7 +30,8 @@ def test_every_value_is_text_and_an_empty_one_means_the_default() -> None:
             "OTHER": "x",
         }
     )
-    assert (settings.port, settings.weights, settings.device) == (0, Path("/models/a.safetensors"), "cuda:1")
+    assert (settings.port, settings.device) == (0, "cuda:1")
+    assert settings.weights == {"tesnet": Path("/models/a.safetensors")}
     assert settings.max_body_bytes == 2**19
 
 
@@ -45,7 +47,11 @@ def test_every_value_is_text_and_an_empty_one_means_the_default() -> None:
         ("GRASP_MAX_BODY_MB", "nan", "4096"),
         ("GRASP_QUEUE_SIZE", "2.5", "10,000"),
         ("GRASP_MAX_BATCH", "65", "together"),
-        ("GRASP_MODELS", "tesnet,gpd", "tesnet"),
+        ("GRASP_MODELS", "tesnet,vgn", "pointnetgpd"),
+        ("GRASP_MODELS", "gpd,gpd", "separated by commas"),
+        ("GRASP_MODELS", ",", "heuristic"),
+        ("GRASP_WEIGHTS", "gpd=a.safetensors", "only network"),
+        ("GRASP_WEIGHTS", "tesnet=", "NAME=PATH"),
         ("GRASP_REQUEST_TIMEOUT", "0", "3600"),
         ("GRASP_DRAIN_TIMEOUT", "inf", "3600"),
         ("GRASP_CORS_ORIGINS", "robot.example", "https://"),
@@ -89,3 +95,23 @@ def test_keys_and_origins_are_lists_and_keys_are_never_shown() -> None:
 def test_unknown_variables_come_with_the_closest_known_name() -> None:
     found = unknown_variables({"GRASP_MAX_POINT": "1", "GRASP_PORT": "1", "GRASP_ZZZZZZZZZ": "1", "PATH": "/"})
     assert found == {"GRASP_MAX_POINT": "GRASP_MAX_POINTS", "GRASP_ZZZZZZZZZ": None}
+
+
+def test_several_networks_have_their_weights_by_name() -> None:
+    names = {"GRASP_MODELS": "TESNET, edgegrasp,heuristic"}
+    assert load_settings(names).models == ("tesnet", "edgegrasp", "heuristic")
+    assert load_settings(names).weights == {}
+    one = load_settings(names | {"GRASP_WEIGHTS": "edgegrasp=/a=b/edge.safetensors"})
+    assert one.weights == {"edgegrasp": Path("/a=b/edge.safetensors")}
+    two = load_settings(names | {"GRASP_WEIGHTS": "edgegrasp=e.safetensors, tesnet=t.safetensors"})
+    assert two.weights == {"edgegrasp": Path("e.safetensors"), "tesnet": Path("t.safetensors")}
+    with pytest.raises(InvalidSetting, match=r"GRASP_WEIGHTS is 'a\.safetensors'; expected: .* NAME=PATH for each"):
+        load_settings(names | {"GRASP_WEIGHTS": "a.safetensors"})
+
+
+def test_a_path_with_an_equals_sign_is_a_path() -> None:
+    assert load_settings({"GRASP_WEIGHTS": "/run=3/a.safetensors"}).weights == {"tesnet": Path("/run=3/a.safetensors")}
+
+
+def test_the_networks_are_those_of_the_library() -> None:
+    assert set(NETWORK_NAMES) == set(networks.NETWORKS)

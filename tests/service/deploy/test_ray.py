@@ -115,7 +115,7 @@ def test_fewer_replicas_are_as_far_off_as_the_option_says() -> None:
 
 def test_a_replica_without_weights_does_not_start(tmp_path: Path) -> None:
     async def go() -> None:
-        app = replica_app(Settings(device="cpu", weights=tmp_path / "none.safetensors"))
+        app = replica_app(Settings(device="cpu", weights={"tesnet": tmp_path / "none.safetensors"}))
         async with app.router.lifespan_context(app):
             raise AssertionError("started")
 
