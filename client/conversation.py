@@ -12,7 +12,7 @@ from collections.abc import Callable, Generator, Mapping
 from dataclasses import dataclass, replace
 from typing import TypeAlias, TypeVar
 
-from client.errors import Overloaded, ProblemError, ServiceTimeout, ServiceUnreachable
+from client.errors import Overloaded, ProblemError, ServiceTimeout, ServiceUnreachable, UnexpectedResponse
 from client.reply import Answer, problem
 from client.request import Request
 from client.retry import RetryPolicy
@@ -31,7 +31,7 @@ POLL_INTERVAL = 0.1
 
 @dataclass(frozen=True, slots=True)
 class Send:
-    """Send the request; the outcome is an `Answer`, `ConnectionLost` or `TimedOut`, after `timeout` seconds at most."""
+    """Send the request; the outcome is an `Answer` or a failure, after `timeout` seconds at most."""
 
     request: Request
     timeout: float
@@ -56,8 +56,16 @@ class TimedOut:
     """The time given to `Send` passed."""
 
 
+@dataclass(frozen=True, slots=True)
+class Unusable:
+    """An answer came that is not to be read to its end."""
+
+    why: str
+    status: int
+
+
 Step: TypeAlias = Send | Wait
-Outcome: TypeAlias = Answer | ConnectionLost | TimedOut | None
+Outcome: TypeAlias = Answer | Unusable | ConnectionLost | TimedOut | None
 Conversation: TypeAlias = Generator[Step, Outcome, T]
 
 
@@ -76,7 +84,7 @@ def ask(
         ServiceUnreachable: the connection, or a proxy's to the service, was refused or lost on every try.
         ServiceTimeout: no answer in time.
         ProblemError: the service refused or failed; see `client.errors` for the kinds.
-        UnexpectedResponse: the answer is not this service's.
+        UnexpectedResponse: the answer is not this service's, or larger than it may be.
     """
     deadline = clock() + timeout
     retries = 0
@@ -88,6 +96,8 @@ def ask(
             raise ServiceTimeout(
                 f"no answer within {timeout:g} s; raise `timeout`, or lower `num_approach_points` and `max_candidates`"
             )
+        if isinstance(outcome, Unusable):
+            raise UnexpectedResponse(f"{outcome.why}; status {outcome.status}; check the URL", outcome.status)
         if isinstance(outcome, ConnectionLost):
             error = ServiceUnreachable(f"{outcome.why}; is the service running, and is the URL right?")
         else:
@@ -130,7 +140,7 @@ def await_ready(*, timeout: float, clock: Clock) -> Conversation[None]:
 
 
 def _seen(outcome: Outcome) -> str:
-    if isinstance(outcome, ConnectionLost):
+    if isinstance(outcome, ConnectionLost | Unusable):
         return outcome.why
     if isinstance(outcome, Answer):
         error = problem(outcome)

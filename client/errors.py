@@ -6,7 +6,7 @@
     +-- InvalidArgument          refused here, before anything is sent; also a ValueError; `argument` names it
     +-- ServiceUnreachable       no connection, or lost on every try, by a proxy before the service too
     +-- ServiceTimeout           no answer within the caller's timeout
-    +-- UnexpectedResponse       an answer, but not this service's: wrong URL, a proxy's page, another version
+    +-- UnexpectedResponse       not this service's answer, or too large: wrong URL, a proxy's page, another version
     +-- ProblemError             the service's own problem+json: status, title, detail, request_id, problem
         +-- BadRequest             400  the body cannot be decoded
         +-- Unauthorized           401  API key missing or wrong

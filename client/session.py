@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import asyncio
+import math
 import random
 import time
 import uuid
@@ -14,6 +15,7 @@ from urllib.parse import urlsplit
 import httpx
 from numpy.typing import ArrayLike
 
+from client.answer_body import AnswerBody, UnusableBody
 from client.conversation import (
     PROBE_TIMEOUT,
     ConnectionLost,
@@ -22,6 +24,7 @@ from client.conversation import (
     Send,
     Step,
     TimedOut,
+    Unusable,
     Wait,
     ask,
     await_ready,
@@ -39,6 +42,7 @@ from client.request import (
     points_request,
 )
 from client.retry import RetryPolicy
+from client.transport import DeadlineTransport, TimeLeft, proxy_for, tls_context
 from service.schemas import MAX_TIMEOUT_S
 
 if TYPE_CHECKING:
@@ -50,8 +54,8 @@ T = TypeVar("T")
 
 DEFAULT_TIMEOUT = 30.0
 
-_DIRECT: Mapping[str, None] = dict.fromkeys(("all://127.0.0.1", "all://localhost", "all://[::1]"))
-"""httpx's patterns of what no proxy that the environment names could reach for us: this machine itself."""
+DEFAULT_MAX_ANSWER_MB = 64.0
+"""Many times what a thousand grasps take."""
 
 
 class _Plans:
@@ -65,15 +69,18 @@ class _Plans:
         retry: RetryPolicy | None,
         api_key: str | None,
         headers: Mapping[str, str] | None,
+        max_answer_mb: float,
     ) -> None:
-        parts = urlsplit(base_url)
-        if parts.scheme not in ("http", "https") or not parts.hostname:
-            raise InvalidArgument("base_url", f"is {base_url!r}; give one like http://127.0.0.1:8000")
+        self._url = _checked_url(base_url)
         self._base_url = base_url.rstrip("/")
+        if not 0 < max_answer_mb < math.inf:
+            raise InvalidArgument("max_answer_mb", f"is {max_answer_mb:g}; give more than 0 and a finite number")
+        self._max_answer = int(max_answer_mb * 2**20)
         self._timeout = _checked_timeout(timeout)
         self._policy = retry or RetryPolicy()
         self._rng = random.Random()
-        self._headers = {name: header_value(f"headers[{name!r}]", value) for name, value in (headers or {}).items()}
+        self._headers = {"Accept-Encoding": "gzip"}
+        self._headers |= {name: header_value(f"headers[{name!r}]", value) for name, value in (headers or {}).items()}
         if api_key is not None:
             self._headers["X-API-Key"] = header_value("api_key", api_key)
 
@@ -101,15 +108,18 @@ class _Plans:
     def _model(self, timeout: float | None) -> Conversation[ModelReply]:
         return self._ask(Request("GET", "/model", headers={"Accept": "application/json"}), model_reply, timeout)
 
-    def _http_arguments(self, step: Send) -> dict[str, Any]:
-        """The arguments of httpx for a step."""
+    def _http_arguments(self, step: Send, end: float) -> dict[str, Any]:
+        """The arguments of httpx for a step that ends at a moment of `time.monotonic`."""
         return {
             "method": step.request.method,
             "url": self._base_url + step.request.target,
             "content": step.request.content,
             "headers": {**self._headers, **step.request.headers},
-            "extensions": {"timeout": _TimeLeft(step.timeout)},
+            "extensions": {"timeout": TimeLeft(end)},
         }
+
+    def _body(self, response: httpx.Response) -> AnswerBody:
+        return AnswerBody(response.headers.get("Content-Encoding", ""), self._max_answer)
 
 
 class GraspClient(_Plans):
@@ -121,13 +131,17 @@ class GraspClient(_Plans):
         retry: when to try again. Grasping is a pure computation, so trying a lost connection again is safe.
         api_key: one of the service's `GRASP_API_KEYS`, where it has any.
         headers: sent with every request, for instance the credentials that a proxy before the service wants.
+        max_answer_mb: largest answer, unpacked, MB of 2^20 bytes; a larger one is an `UnexpectedResponse`.
+        proxy: URL of the proxy to go through; without it the one that the environment names (`HTTPS_PROXY`, ...), but
+            none to a service on this machine.
         transport: replaces the network, for tests and special transports.
 
     Raises:
-        InvalidArgument: a URL that is not http or https, a timeout that is not positive, an impossible key or header.
+        InvalidArgument: a URL that is not http or https, a time-out or size that is not positive, an impossible key,
+            header or proxy.
 
-    Every method raises the errors drawn in `client.errors`. Proxies that the environment names (`HTTPS_PROXY`, ...) are
-    used, except for services on this machine.
+    Every method raises the errors drawn in `client.errors`, and no others. The time-out is kept whatever the service
+    does, but looking its name up takes as long as the system lets it.
     """
 
     def __init__(
@@ -138,10 +152,17 @@ class GraspClient(_Plans):
         retry: RetryPolicy | None = None,
         api_key: str | None = None,
         headers: Mapping[str, str] | None = None,
+        max_answer_mb: float = DEFAULT_MAX_ANSWER_MB,
+        proxy: str | None = None,
         transport: httpx.BaseTransport | None = None,
     ) -> None:
-        super().__init__(base_url, timeout=timeout, retry=retry, api_key=api_key, headers=headers)
-        self._http = httpx.Client(transport=transport, mounts=_DIRECT)
+        super().__init__(
+            base_url, timeout=timeout, retry=retry, api_key=api_key, headers=headers, max_answer_mb=max_answer_mb
+        )
+        if transport is None:
+            through = proxy_for(self._url, proxy)
+            transport = DeadlineTransport(through, tls_context(self._url, through))
+        self._http = httpx.Client(transport=transport, trust_env=False)
 
     def grasps(
         self,
@@ -234,15 +255,22 @@ class GraspClient(_Plans):
             return None
         end = time.monotonic() + step.timeout
         try:
-            with self._http.stream(**self._http_arguments(step)) as response:
-                chunks = []
-                for chunk in response.iter_bytes():
-                    chunks.append(chunk)
-                    if time.monotonic() > end:
-                        return TimedOut()
-                return _answer(response, chunks)
+            with self._http.stream(**self._http_arguments(step, end)) as response:
+                return self._read(response, end)
         except httpx.RequestError as error:
             return _failure(error, self._base_url)
+
+    def _read(self, response: httpx.Response, end: float) -> Outcome:
+        assert isinstance(response.stream, httpx.SyncByteStream)
+        try:
+            body = self._body(response)
+            for chunk in response.stream:  # packed, where `iter_bytes` would unpack without a limit
+                body.add(chunk)
+                if time.monotonic() > end:
+                    return TimedOut()
+            return _answer(response, body)
+        except UnusableBody as error:
+            return Unusable(str(error), response.status_code)
 
 
 class AsyncGraspClient(_Plans):
@@ -256,10 +284,17 @@ class AsyncGraspClient(_Plans):
         retry: RetryPolicy | None = None,
         api_key: str | None = None,
         headers: Mapping[str, str] | None = None,
+        max_answer_mb: float = DEFAULT_MAX_ANSWER_MB,
+        proxy: str | None = None,
         transport: httpx.AsyncBaseTransport | None = None,
     ) -> None:
-        super().__init__(base_url, timeout=timeout, retry=retry, api_key=api_key, headers=headers)
-        self._http = httpx.AsyncClient(transport=transport, mounts=_DIRECT)
+        super().__init__(
+            base_url, timeout=timeout, retry=retry, api_key=api_key, headers=headers, max_answer_mb=max_answer_mb
+        )
+        if transport is None:
+            through = proxy_for(self._url, proxy)
+            transport = httpx.AsyncHTTPTransport(verify=tls_context(self._url, through), proxy=through)
+        self._http = httpx.AsyncClient(transport=transport, trust_env=False)
 
     async def grasps(
         self,
@@ -330,32 +365,40 @@ class AsyncGraspClient(_Plans):
         if isinstance(step, Wait):
             await asyncio.sleep(step.seconds)
             return None
-        end = time.monotonic() + step.timeout
         try:
-            async with self._http.stream(**self._http_arguments(step)) as response:
-                chunks = []
-                async for chunk in response.aiter_bytes():
-                    chunks.append(chunk)
-                    if time.monotonic() > end:
-                        return TimedOut()
-                return _answer(response, chunks)
+            return await asyncio.wait_for(self._exchange(step), step.timeout)
+        except asyncio.TimeoutError:
+            return TimedOut()
         except httpx.RequestError as error:
             return _failure(error, self._base_url)
 
+    async def _exchange(self, step: Send) -> Outcome:
+        async with self._http.stream(**self._http_arguments(step, time.monotonic() + step.timeout)) as response:
+            assert isinstance(response.stream, httpx.AsyncByteStream)
+            try:
+                body = self._body(response)
+                async for chunk in response.stream:  # packed, where `aiter_bytes` would unpack without a limit
+                    body.add(chunk)
+                return _answer(response, body)
+            except UnusableBody as error:
+                return Unusable(str(error), response.status_code)
 
-class _TimeLeft(dict[str, float]):
-    """httpx's timeout extension, whose entries are the time left when they are looked up.
 
-    httpx gives each phase of a request (pool, connect, write, read) a timeout of its own; looked up late, they add up
-    to one deadline.
-    """
-
-    def __init__(self, seconds: float) -> None:
-        super().__init__(dict.fromkeys(("pool", "connect", "write", "read"), seconds))
-        self._end = time.monotonic() + seconds
-
-    def get(self, key: str, default: Any = None) -> Any:
-        return max(self._end - time.monotonic(), 0.001) if key in self else default
+def _checked_url(base_url: str) -> httpx.URL:
+    example = "give one like http://127.0.0.1:8000"
+    try:
+        url = httpx.URL(base_url)
+        url.host.encode("idna")  # as the resolver does
+        urlsplit(base_url).port  # noqa: B018 - a ValueError where it is over 65535, which httpx lets pass
+    except (httpx.InvalidURL, ValueError) as error:
+        raise InvalidArgument("base_url", f"is {base_url!r}, which is no URL ({error}); {example}") from None
+    if url.scheme not in ("http", "https") or not url.host:
+        raise InvalidArgument("base_url", f"is {base_url!r}; {example}")
+    if "?" in base_url or "#" in base_url:
+        raise InvalidArgument(
+            "base_url", f"is {base_url!r}; what is asked is put after it, so {example}, without ? or #"
+        )
+    return url
 
 
 def _checked_timeout(timeout: float) -> float:
@@ -364,10 +407,9 @@ def _checked_timeout(timeout: float) -> float:
     return timeout
 
 
-def _answer(response: httpx.Response, chunks: list[bytes]) -> Answer:
-    return Answer(
-        response.status_code, {name.lower(): value for name, value in response.headers.items()}, b"".join(chunks)
-    )
+def _answer(response: httpx.Response, body: AnswerBody) -> Answer:
+    headers = {name.lower(): value for name, value in response.headers.items()}
+    return Answer(response.status_code, headers, body.content())
 
 
 def _failure(error: httpx.RequestError, base_url: str) -> Outcome:

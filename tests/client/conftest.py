@@ -8,6 +8,7 @@ import socket
 import struct
 import threading
 from collections.abc import Awaitable, Callable, Iterator, Mapping
+from contextlib import suppress
 from dataclasses import dataclass, field
 from http.server import BaseHTTPRequestHandler, ThreadingHTTPServer
 from typing import Any, cast
@@ -120,6 +121,48 @@ def server() -> Iterator[ScriptedServer]:
     scripted.shutdown()
     scripted.server_close()
     thread.join()
+
+
+@dataclass
+class Peer:
+    """A server whose connections behave as the test says; `hung_up` counts those that clients closed early."""
+
+    url: str
+    connections: int = 0
+    hung_up: threading.Semaphore = field(default_factory=lambda: threading.Semaphore(0))
+
+
+@pytest.fixture
+def start_peer() -> Iterator[Callable[[Callable[[socket.socket], None]], Peer]]:
+    """`start_peer(behave)`: a `Peer` on a free loopback port that hands each connection to `behave`."""
+    listeners: list[socket.socket] = []
+
+    def start(behave: Callable[[socket.socket], None]) -> Peer:
+        listener = socket.create_server(("127.0.0.1", 0))
+        listeners.append(listener)
+        peer = Peer(f"http://127.0.0.1:{listener.getsockname()[1]}")
+
+        def serve(connection: socket.socket) -> None:
+            with connection:
+                try:
+                    behave(connection)
+                except OSError:
+                    peer.hung_up.release()
+
+        def accept() -> None:
+            with suppress(OSError):  # the listener was closed: the test is over
+                while True:
+                    connection, _ = listener.accept()
+                    peer.connections += 1
+                    threading.Thread(target=serve, args=(connection,), daemon=True).start()
+
+        threading.Thread(target=accept, daemon=True).start()
+        return peer
+
+    yield start
+    for listener in listeners:
+        listener.shutdown(socket.SHUT_RDWR)
+        listener.close()
 
 
 @pytest.fixture

@@ -8,7 +8,7 @@ from collections.abc import Callable
 import pytest
 
 import client
-from client.conversation import Send, TimedOut, Wait, ask
+from client.conversation import ConnectionLost, Outcome, Send, TimedOut, Unusable, Wait, ask, await_ready
 from client.reply import Answer, grasp_reply
 from client.request import Request
 from tests.client.conftest import Answering
@@ -68,3 +68,38 @@ def test_a_timeout_ends_the_conversation() -> None:
     assert not isinstance(next(steps), Wait)
     with pytest.raises(client.ServiceTimeout):
         steps.send(TimedOut())
+
+
+@pytest.mark.parametrize(
+    ("outcome", "seen"),
+    [
+        (ConnectionLost("cannot reach it"), "cannot reach it"),
+        (Unusable("the answer has over 2 MB", 200), "the answer has over 2 MB"),
+        (TimedOut(), "no answer"),
+    ],
+)
+def test_waiting_in_vain_says_what_was_seen_last(refusing: Refusing, outcome: Outcome, seen: str) -> None:
+    now = 0.0
+    steps = await_ready(timeout=0.3, clock=lambda: now)
+    step = next(steps)
+    for last in (Answer(503, {}, refusing(503).body), outcome):
+        assert isinstance(step, Send)
+        assert step.timeout == pytest.approx(0.3 - now)
+        now += 0.05
+        assert isinstance(steps.send(last), Wait)
+        now += 0.05
+        step = steps.send(None)
+    now += 0.2
+    with pytest.raises(client.ServiceTimeout, match=rf"not ready after 0\.3 s: {seen}"):
+        steps.send(outcome)
+
+
+def test_an_unusable_answer_is_not_asked_for_again() -> None:
+    policy = client.RetryPolicy()
+    steps = ask(
+        Request("GET", "/model"), grasp_reply, timeout=5, policy=policy, clock=lambda: 0.0, rng=random.Random(0)
+    )
+    next(steps)
+    with pytest.raises(client.UnexpectedResponse, match="over 2 MB; status 502; check the URL") as caught:
+        steps.send(Unusable("the answer has over 2 MB", 502))
+    assert caught.value.status == 502
