@@ -41,7 +41,7 @@ def test_the_options_are_those_of_the_command() -> None:
 
 def test_the_metrics_are_those_that_are_exported() -> None:
     metrics = Metrics()
-    metrics.watch(lambda: 0, lambda: 0, lambda: True)
+    metrics.watch(lambda: 0, lambda: 0, lambda: True, lambda: 0)
     exported = set(re.findall(r"^# TYPE (grasp_\w+) ", metrics.text().decode(), re.MULTILINE))
     exported -= {name for name in exported if name.endswith("_created")}
     assert set(re.findall(r"`(grasp_\w+)`", PAGE)) == exported

@@ -11,7 +11,6 @@ from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx
-import numpy as np
 import pytest
 
 from service import payloads
@@ -197,17 +196,17 @@ def test_what_waits_holds_its_cloud_and_not_its_body(
     eventually(lambda: server.memory.held == 0)
 
 
+def post_cloud(url: str, points: int) -> httpx.Response:
+    return httpx.post(f"{url}/grasps", content=bytes(12 * points), headers=OCTETS, timeout=PATIENCE_S)
+
+
 def test_clouds_that_wait_are_limited_together_whatever_their_bodies_were(
     serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, eventually: Eventually
 ) -> None:
     server = serve(max_held_mb=0.25)
-    cloud = np.zeros((10_000, 3), np.float32).tobytes()
-    asked = [
-        pool.submit(httpx.post, f"{server.url}/grasps", content=cloud, headers=OCTETS, timeout=PATIENCE_S)
-        for _ in range(8)
-    ]
+    asked = [pool.submit(post_cloud, server.url, 10_000) for _ in range(8)]
     eventually(lambda: sum(answer.done() for answer in asked) == 6)
-    assert server.memory.held == 2 * len(cloud)
+    assert server.memory.held == 2 * 120_000
     server.predictor.gate.set()
     assert sorted(answer.result().status_code for answer in asked) == [200] * 2 + [429] * 6
 
@@ -227,12 +226,8 @@ def test_a_small_body_is_decoded_beside_large_ones(
             assert gate.wait(PATIENCE_S)
         return decode(body, max_points)
 
-    monkeypatch.setitem(payloads._DECODERS, "application/octet-stream", held)  # type: ignore[arg-type]
-    large = np.zeros((100_000, 3), np.float32).tobytes()
-    asked = [
-        pool.submit(httpx.post, f"{server.url}/grasps", content=large, headers=OCTETS, timeout=PATIENCE_S)
-        for _ in range(3)
-    ]
+    monkeypatch.setitem(payloads._DECODERS, "application/octet-stream", held)
+    asked = [pool.submit(post_cloud, server.url, 100_000) for _ in range(3)]
     assert entered.acquire(timeout=PATIENCE_S)
     assert post(server.url).status_code == 200
     gate.set()

@@ -2,6 +2,8 @@
 
 from __future__ import annotations
 
+from functools import partial
+
 import pytest
 from hypothesis import given
 from hypothesis import strategies as st
@@ -52,7 +54,7 @@ def test_over_the_limit_what_lies_there_the_longest_goes_first(events: list[tupl
             lying.remove(share)
         elif share not in lying and size:
             lying.append(share)
-        memory.keep_lying(share, size, lambda share=share: closed.append(share))
+        memory.keep_lying(share, size, partial(closed.append, share))
         while closed:
             assert closed.pop(0) is lying.pop(0)
         assert memory.held == sum(one.size for one in lying) <= 100
