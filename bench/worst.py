@@ -44,12 +44,12 @@ def queries() -> Mapping[str, Callable[[], GraspQuery]]:
 
     def sheet() -> GraspQuery:
         """Along a side of the workspace, where the most places are taken for occupied."""
-        points = np.column_stack([np.full(40_000, 0.0005), rng.uniform(0, 0.5, (40_000, 2))])
+        points = np.column_stack([np.full(40_000, 0.0005), rng.uniform(0, 0.5, (40_000, 2))]).astype(np.float32)
         box = Box(np.zeros(3), np.array([0.5, 0.5, 0.5]))
         return replace(base, points=points, workspace=box, support_height=None)
 
     def everywhere(width: float) -> GraspQuery:
-        points = rng.uniform(-width / 2, width / 2, (MOST_POINTS, 3))
+        points = rng.uniform(-width / 2, width / 2, (MOST_POINTS, 3)).astype(np.float32)
         return replace(base, points=points, workspace=None, support_height=None, viewpoints=views, unseen="occupied")
 
     return {

@@ -65,7 +65,7 @@ def test_answers_that_nobody_reads_are_counted_and_end_with_their_connections(
         def closed() -> bool:
             nonlocal most
             most = max(most, server.memory.held)
-            return 0 == server.memory.held < most
+            return bool(0 == server.memory.held < most)
 
         eventually(closed)
     assert post(server.url, X_Request_Timeout="0.1").status_code == 504  # the service is well
