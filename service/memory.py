@@ -1,8 +1,8 @@
 """Bytes that are held for requests: bodies, clouds that wait, answers on their way. For the event loop's thread alone.
 
 A lone request is always served, whatever it holds; beside others it is refused where the limit would be passed.
-What clients leave lying, answers that they do not read and heads that they do not finish, cannot be refused: over the
-limit, the one that lies there the longest loses its connection.
+What clients leave lying, answers that they do not read and heads that they do not finish, cannot be refused: before
+anybody is, the one that lies there the longest loses its connection.
 """
 
 from __future__ import annotations
@@ -47,11 +47,16 @@ class Memory:
             self._lying.setdefault(share, close)
         else:
             self._lying.pop(share, None)
-        while self.held > self.limit and self._lying and self.held > share.size:
+        if self.held > share.size:  # a lone one may lie
+            self.make_room(0)
+
+    def make_room(self, size: int) -> None:
+        """Close what lies there the longest until so many bytes more may be held, or nothing lies there any more."""
+        while self._lying and self.held + size > self.limit:
             oldest = next(iter(self._lying))
-            close_oldest = self._lying.pop(oldest)
+            close = self._lying.pop(oldest)
             oldest.release()
-            close_oldest()
+            close()
 
 
 class Share:
@@ -67,6 +72,7 @@ class Share:
         Raises:
             QueueFull: more than before, and with what others hold more than the limit.
         """
+        self._memory.make_room(size - self.size)
         others = self._memory.held - self.size
         if size > self.size and others > 0 and others + size > self._memory.limit:
             raise QueueFull(

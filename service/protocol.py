@@ -7,6 +7,7 @@ from __future__ import annotations
 
 import asyncio
 import math
+import socket
 from typing import TYPE_CHECKING, Any
 
 import h11
@@ -27,6 +28,9 @@ UNREAD_SECONDS = 10.0
 UNREAD_BYTES = 65_536
 """Who reads less of an answer than this in `UNREAD_SECONDS` has its connection closed."""
 
+SEND_BUFFER = 131_072
+"""Bytes that the system is asked to take of an answer that is not read: on its own it takes megabytes a connection."""
+
 PROBES_S = (0.05, 1.0)
 """When to look whether a client that has said all it will say still listens: for the first time, and then each time."""
 
@@ -42,6 +46,7 @@ class Reluctant(asyncio.Protocol):
 
     memory = Memory(math.inf)
     unread_seconds = UNREAD_SECONDS
+    unread_bytes = UNREAD_BYTES
     _transport: asyncio.Transport
     _unread_timer: asyncio.TimerHandle | None = None
 
@@ -54,6 +59,7 @@ class Reluctant(asyncio.Protocol):
         """A client is there; every byte that waits for it is told."""
         super().connection_made(transport)
         transport.set_write_buffer_limits(high=0)
+        transport.get_extra_info("socket").setsockopt(socket.SOL_SOCKET, socket.SO_SNDBUF, SEND_BUFFER)
         self._transport = transport
         self._share = self.memory.share()
 
@@ -81,7 +87,7 @@ class Reluctant(asyncio.Protocol):
     def _check_unread(self) -> None:
         before = self._share.size
         self._count_unread()
-        if self._share.size > before - UNREAD_BYTES:
+        if self._share.size > before - self.unread_bytes:
             self._transport.abort()
         else:
             loop = asyncio.get_running_loop()

@@ -58,3 +58,14 @@ def test_over_the_limit_what_lies_there_the_longest_goes_first(events: list[tupl
         while closed:
             assert closed.pop(0) is lying.pop(0)
         assert memory.held == sum(one.size for one in lying) <= 100
+
+
+def test_what_lies_there_gives_way_to_a_request() -> None:
+    memory = Memory(100)
+    lying, request = memory.share(), memory.share()
+    closed: list[str] = []
+    memory.keep_lying(lying, 90, lambda: closed.append("closed"))
+    request.resize(10)
+    assert closed == []
+    request.resize(20)
+    assert (closed, memory.held) == (["closed"], 20)
