@@ -17,11 +17,12 @@ from typing import Any, cast
 import numpy as np
 from numpy.typing import NDArray
 
-from client.cloud_file import READERS, CloudFileError, decode_cloud, read_bytes, read_cloud, read_npy
+from client.cloud_file import CloudFileError, decode, read_bytes, read_cloud
 from client.errors import GraspClientError, InvalidArgument, Overloaded, ProblemError
 from client.reply import GraspReply
 from client.request import DEFAULT_DEPTH_SCALE, GraspOptions, GripperSize
 from client.session import DEFAULT_TIMEOUT, GraspClient
+from tesnet import formats
 from tesnet.geometry import FRAME_CONVENTIONS
 from tesnet.hands import HANDS
 
@@ -37,9 +38,13 @@ def main(arguments: Sequence[str] | None = None) -> int:
     parser = _parser()
     chosen = parser.parse_args(arguments)
     if chosen.intrinsics is None and any(
-        value is not None for value in (chosen.mask, chosen.camera_pose, chosen.depth_scale)
+        value is not None
+        for value in (chosen.mask, chosen.target_label, chosen.camera_pose, chosen.depth_scale, chosen.stride)
     ):
-        parser.error("--mask, --camera-pose and --depth-scale belong to a depth image; give its --intrinsics as well")
+        parser.error(
+            "--mask, --target-label, --camera-pose, --depth-scale and --stride belong to a depth image; give its "
+            "--intrinsics as well"
+        )
     if chosen.support_height is not None and chosen.up is None:
         parser.error("--support-height is measured along `up`; give --up as well, for instance --up 0 0 1")
     try:
@@ -65,7 +70,7 @@ def table(reply: GraspReply) -> str:
 def _ask(client: GraspClient, chosen: argparse.Namespace) -> GraspReply:
     options = _options(chosen)
     if chosen.intrinsics is None:
-        return client.grasps(_points(chosen.cloud), request_id=chosen.request_id, **options)
+        return _ask_of_cloud(client, chosen, options)
     fx, fy, cx, cy = chosen.intrinsics
     return client.grasps_from_depth(
         read_bytes(Path(chosen.cloud)),
@@ -73,13 +78,29 @@ def _ask(client: GraspClient, chosen: argparse.Namespace) -> GraspReply:
         mask=None if chosen.mask is None else read_bytes(chosen.mask),
         T_cloud_camera=None if chosen.camera_pose is None else np.reshape(chosen.camera_pose, (4, 4)),
         depth_scale=DEFAULT_DEPTH_SCALE if chosen.depth_scale is None else chosen.depth_scale,
+        stride=chosen.stride or 1,
         request_id=chosen.request_id,
         **options,
     )
 
 
-def _points(cloud: str) -> NDArray[Any]:
-    return decode_cloud(sys.stdin.buffer.read(), read_npy, "stdin") if cloud == "-" else read_cloud(Path(cloud))
+def _ask_of_cloud(client: GraspClient, chosen: argparse.Namespace, options: GraspOptions) -> GraspReply:
+    name = chosen.cloud
+    cloud = decode(sys.stdin.buffer.read(), formats.read, "stdin") if name == "-" else read_cloud(Path(name))
+    if cloud.viewpoint is not None:
+        place = " ".join(f"{number:g}" for number in cloud.viewpoint)
+        if "viewpoint" in options:
+            print(f"warning: the viewpoint {place} of the file is ignored, since --viewpoint is given", file=sys.stderr)
+        else:
+            options["viewpoint"] = cloud.viewpoint
+            print(f"warning: viewpoint is that of the file: {place}", file=sys.stderr)
+    normals = cloud.normals if chosen.normals is None else _array(chosen.normals)
+    view_index = None if chosen.view_index is None else _array(chosen.view_index)
+    return client.grasps(cloud.points, view_index=view_index, normals=normals, request_id=chosen.request_id, **options)
+
+
+def _array(path: Path) -> NDArray[Any]:
+    return decode(read_bytes(path), formats.npy_array, str(path))
 
 
 def _show(reply: GraspReply, *, as_json: bool) -> None:
@@ -113,6 +134,8 @@ def _options(chosen: argparse.Namespace) -> GraspOptions:
         options["min_separation"] = {"translation": chosen.min_separation[0], "rotation_deg": chosen.min_separation[1]}
     if chosen.target_box is not None:
         options["target"] = {"box": {"min": chosen.target_box[:3], "max": chosen.target_box[3:]}}
+    if chosen.target_label is not None:
+        options["target"] = {"label": chosen.target_label}
     if chosen.gripper is not None:
         options["gripper"] = _gripper(chosen.gripper)
     for name in _PLAIN_OPTIONS:
@@ -176,7 +199,8 @@ def _parser() -> argparse.ArgumentParser:
     add = parser.add_argument
     add(
         "cloud",
-        help=f"file ({', '.join(READERS)}; with --intrinsics a depth image, 16-bit .png), or - for .npy on stdin",
+        help=f"file ({', '.join(formats.SUFFIXES)}; with --intrinsics a depth image, 16-bit .png or .npy), or - for "
+        "such a file on stdin",
     )
     add(
         "--url",
@@ -189,9 +213,15 @@ def _parser() -> argparse.ArgumentParser:
     image = parser.add_argument_group("of a depth image")
     add = image.add_argument
     add("--intrinsics", type=_number, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="its camera, in pixels")
-    add("--mask", type=Path, metavar="FILE", help="8-bit .png of the same size; only what it marks is grasped")
+    add("--mask", type=Path, metavar="FILE", help="8- or 16-bit .png of the same size; only what it marks is grasped")
+    add("--target-label", type=int, metavar="N", help="number of what is to be grasped in the mask")
     add("--camera-pose", type=_number, nargs=16, metavar="M", help="T_cloud_camera, row by row (default: identity)")
     add("--depth-scale", type=_number, metavar="M", help=f"metres per count (default: {DEFAULT_DEPTH_SCALE:g})")
+    add("--stride", type=int, metavar="N", help="use every N-th row and column")
+    beside = parser.add_argument_group("of a cloud")
+    add = beside.add_argument
+    add("--view-index", type=Path, metavar="FILE", help=".npy: which --viewpoint saw each point, from 0")
+    add("--normals", type=Path, metavar="FILE", help=".npy: outward normals of the points")
     wire = parser.add_argument_group("options of the request")
     add = wire.add_argument
     vector = ("X", "Y", "Z")

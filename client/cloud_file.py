@@ -1,23 +1,19 @@
-"""A cloud file -> points (N, 3), for the command line. Knows no service.
+"""Cloud files for the command line, in the formats of `tesnet.formats`. Knows no service.
 
 A compressed .pcd needs the extra `files`; everything else numpy only.
 """
 
 from __future__ import annotations
 
-import io
-from collections.abc import Callable, Mapping
+from collections.abc import Callable
 from pathlib import Path
-from types import MappingProxyType
-from typing import Any
+from typing import TypeVar
 
-import numpy as np
-from numpy.typing import NDArray
-
+from tesnet import formats
 from tesnet.errors import TesnetError
-from tesnet.formats import read_pcd, read_ply, seen
+from tesnet.formats import CloudFile
 
-Points = NDArray[Any]
+Content = TypeVar("Content")
 
 
 class CloudFileError(Exception):
@@ -34,16 +30,16 @@ class CloudFileError(Exception):
         self.why = why
 
 
-def read_cloud(path: Path) -> Points:
-    """Points (N, 3) of a .npy, .ply, .pcd, .xyz or .txt file, as numbers of the file's own precision.
+def read_cloud(path: Path) -> CloudFile:
+    """What a cloud file says, in numbers of the file's own precision; its suffix tells the format.
 
     Raises:
         CloudFileError: missing, another format, damaged, or its reader is not installed.
     """
-    reader = READERS.get(path.suffix.lower())
-    if reader is None:
-        raise CloudFileError(str(path), f"ends in {path.suffix or 'nothing'!r}; valid: {', '.join(READERS)}")
-    return decode_cloud(read_bytes(path), reader, str(path))
+    found = next((entry for entry in formats.FORMATS if path.suffix.lower() in entry.suffixes), None)
+    if found is None:
+        raise CloudFileError(str(path), f"ends in {path.suffix or 'nothing'!r}; valid: {', '.join(formats.SUFFIXES)}")
+    return decode(read_bytes(path), found.read, str(path))
 
 
 def read_bytes(path: Path) -> bytes:
@@ -58,8 +54,8 @@ def read_bytes(path: Path) -> bytes:
         raise CloudFileError(str(path), f"cannot be read: {error.strerror or error}") from error
 
 
-def decode_cloud(content: bytes, reader: Callable[[bytes], Points], name: str) -> Points:
-    """Points (N, 3) of a file's content.
+def decode(content: bytes, reader: Callable[[bytes], Content], name: str) -> Content:
+    """What a reader makes of a file's content.
 
     Raises:
         CloudFileError: empty, damaged, or its reader is not installed.
@@ -80,32 +76,8 @@ def decode_cloud(content: bytes, reader: Callable[[bytes], Points], name: str) -
         ) from error
 
 
-def read_npy(content: bytes) -> Points:
-    """Points of a .npy array (N, 3); pickled objects are refused."""
-    return np.asarray(np.lib.format.read_array(io.BytesIO(content), allow_pickle=False))
-
-
-def read_text(content: bytes) -> Points:
-    """Points of text, one a line, as the first three columns; `#` and `//` begin comments.
-
-    Columns are separated by spaces, tabs, commas or semicolons.
-    """
-    text = content.decode().replace(",", " ").replace(";", " ")
-    return np.loadtxt(io.StringIO(text), dtype=np.float64, comments=("#", "//"), usecols=(0, 1, 2), ndmin=2)
-
-
-def read_seen_pcd(content: bytes) -> Points:
-    """Points of a PCD file, without the rows of pixels that have no depth."""
-    points = read_pcd(content)
-    return np.asarray(points[seen(points)])
-
-
 PACKAGES = {"lzf": "python-neo-lzf"}
 """The extra `files`: what is imported, and what is installed."""
-
-READERS: Mapping[str, Callable[[bytes], Points]] = MappingProxyType(
-    {".npy": read_npy, ".ply": read_ply, ".pcd": read_seen_pcd, ".xyz": read_text, ".txt": read_text}
-)
 
 _DAMAGED = (TesnetError, ValueError, TypeError, EOFError, MemoryError)
 """What the readers, numpy among them, raise on a damaged file."""

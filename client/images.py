@@ -36,16 +36,20 @@ def depth_counts(depth: ArrayLike, depth_scale: float) -> NDArray[np.uint16]:
     return np.asarray(image.astype(np.uint16))
 
 
-def mask_levels(mask: ArrayLike, shape: tuple[int, ...] | None) -> NDArray[np.uint8]:
-    """The 8-bit image (height, width) of a mask: 255 where it is not zero.
+def mask_levels(mask: ArrayLike, shape: tuple[int, ...] | None) -> NDArray[Any]:
+    """The image (height, width) of a mask: labels as they are, in 8 or 16 bits; 255 where anything else is not zero.
 
     Raises:
-        InvalidArgument: another shape than the depth image's, or no numbers.
+        InvalidArgument: another shape than the depth image's, no numbers, or labels out of 16 bits.
     """
     image = _image("mask", mask, "biuf")
     if shape is not None and image.shape != shape:
         raise InvalidArgument("mask", f"has shape {image.shape}, the depth image {shape}; give equal shapes")
-    return np.where(image != 0, 255, 0).astype(np.uint8)
+    if image.dtype.kind not in "iu":
+        return np.where(image != 0, 255, 0).astype(np.uint8)
+    if image.min() < 0 or image.max() > MOST_COUNTS:
+        raise InvalidArgument("mask", f"has labels from {image.min()} to {image.max()}; give 0 to {MOST_COUNTS}")
+    return np.asarray(image.astype(np.uint8 if image.max() <= 255 else np.uint16))
 
 
 def png(pixels: NDArray[np.uint16] | NDArray[np.uint8]) -> bytes:

@@ -84,7 +84,10 @@ class Grasp:
 
 @dataclass(frozen=True, slots=True)
 class Counts:
-    """How many points and candidates were left after each stage; `rejected` says what the others failed."""
+    """How many points and candidates were left after each stage; `rejected` says what the others failed.
+
+    `ignored_points` were sent, but hold NaN or an infinity.
+    """
 
     points: int
     prepared_points: int
@@ -92,6 +95,7 @@ class Counts:
     collision_free: int
     returned: int
     rejected: Mapping[str, int]
+    ignored_points: int = 0
 
 
 @dataclass(frozen=True, slots=True)
@@ -239,6 +243,7 @@ def grasp_reply(answer: Answer) -> GraspReply:
             collision_free=counts.collision_free,
             returned=counts.returned,
             rejected=MappingProxyType(counts.rejected.model_dump()),
+            ignored_points=counts.ignored_points,
         ),
         reason=document.reason,
         warnings=tuple(document.warnings),

@@ -22,7 +22,9 @@ from client.errors import InvalidArgument
 from client.form import File, encode_form
 from client.images import depth_counts, mask_levels, png
 from service.schemas import REQUEST_ID
+from tesnet.formats import NPY
 from tesnet.geometry import CameraIntrinsics, Pose
+from tesnet.query import FAR
 
 if TYPE_CHECKING:
     from tesnet.geometry import FrameConvention
@@ -61,6 +63,12 @@ class TargetPoints(TypedDict):
     """Grasp these points: their row numbers in the cloud, or pixel numbers in a depth image, row by row from 0."""
 
     indices: Sequence[int] | NDArray[Any]
+
+
+class TargetLabel(TypedDict):
+    """Grasp the pixels that the mask of a depth image labels with this number."""
+
+    label: int
 
 
 class GripperSize(TypedDict, total=False):
@@ -117,8 +125,8 @@ class GraspOptions(TypedDict, total=False):
         workspace: `{"min": ..., "max": ...}`; points outside are ignored.
         support_height: height of the support plane along `up` (needs `up`), or `"auto"` to find it: a warning then says
             where.
-        target: `{"box": {"min": ..., "max": ...}}` or `{"indices": [...]}`: candidates come from it alone, the other
-            points still count for collision.
+        target: `{"box": {"min": ..., "max": ...}}`, `{"indices": [...]}` or, with a mask, `{"label": N}`: candidates
+            come from it alone, the other points still count for collision.
         approach: `{"direction": ..., "max_angle_deg": ...}`.
         max_grasps: how many to return (default 10).
         min_score: threshold (default 0).
@@ -137,7 +145,7 @@ class GraspOptions(TypedDict, total=False):
     up: Vector
     workspace: Box
     support_height: float | Literal["auto"]
-    target: TargetBox | TargetPoints
+    target: TargetBox | TargetPoints | TargetLabel
     approach: ApproachCone
     max_grasps: int
     min_score: float
@@ -169,23 +177,38 @@ class Request:
     headers: Mapping[str, str] = field(default_factory=lambda: MappingProxyType({}))
 
 
-def points_request(points: ArrayLike, options: Mapping[str, Any], request_id: str | None = None) -> Request:
-    """The request for grasps of points (N, 3), metres.
+def points_request(
+    points: ArrayLike,
+    options: Mapping[str, Any],
+    request_id: str | None = None,
+    *,
+    view_index: ArrayLike | None = None,
+    normals: ArrayLike | None = None,
+) -> Request:
+    """The request for grasps of points (N, 3) or (H, W, 3), metres; see `GraspClient.grasps`.
 
     Raises:
-        InvalidArgument: points that cannot be sent (`checked_points`), or an option that JSON cannot express.
+        InvalidArgument: points that cannot be sent (`checked_points`), other numbers of what belongs to each of them,
+            or an option that JSON cannot express.
         TypeError: an option of another name than those of `GraspOptions`.
     """
     cloud = checked_points(points)
     values = _options(options)
+    beside = {"view_index": view_index, "normals": normals}
+    files = [
+        File(name, f"{name}.npy", _npy(_beside(name, array, len(cloud))))
+        for name, array in beside.items()
+        if array is not None
+    ]
     texts = {name: _json(value) for name, value in values.items()}
     query = urlencode(texts, quote_via=quote)
-    if len(query) > LONGEST_QUERY:
-        return _form_request([File("cloud", "cloud.npy", _npy(cloud))], values, request_id)
-    headers = {"Content-Type": "application/octet-stream", **_headers(request_id)}
-    return Request(
-        "POST", f"/grasps?{query}" if query else "/grasps", cloud.astype("<f4", copy=False).tobytes(), headers
-    )
+    if files or len(query) > LONGEST_QUERY:
+        return _form_request([File("cloud", "cloud.npy", _npy(cloud)), *files], values, request_id)
+    is_far = cloud.dtype == np.float64
+    content_type = "application/x-npy" if is_far else "application/octet-stream"
+    content = _npy(cloud) if is_far else cloud.astype("<f4", copy=False).tobytes()
+    headers = {"Content-Type": content_type, **_headers(request_id)}
+    return Request("POST", f"/grasps?{query}" if query else "/grasps", content, headers)
 
 
 def depth_request(
@@ -196,6 +219,7 @@ def depth_request(
     mask: ArrayLike | bytes | None = None,
     T_cloud_camera: Pose | ArrayLike | None = None,
     depth_scale: float = DEFAULT_DEPTH_SCALE,
+    stride: int = 1,
     request_id: str | None = None,
 ) -> Request:
     """The request for grasps of a depth image; see `GraspClient.grasps_from_depth`.
@@ -205,17 +229,19 @@ def depth_request(
         TypeError: an option of another name than those of `GraspOptions`.
     """
     camera: dict[str, Any] = {"intrinsics": _intrinsics(intrinsics), "depth_scale": depth_scale}
+    if stride != 1:
+        camera["stride"] = stride
     if T_cloud_camera is not None:
         camera["T_cloud_camera"] = _plain("T_cloud_camera", _matrix(T_cloud_camera))
     if isinstance(depth, bytes):
-        files = [File("depth", "depth.png", depth)]
+        files = [File("depth", _image_name("depth", depth), depth)]
         shape = None
     else:
         counts = depth_counts(depth, depth_scale)
         files = [File("depth", "depth.png", png(counts))]
         shape = counts.shape
     if isinstance(mask, bytes):
-        files.append(File("mask", "mask.png", mask))
+        files.append(File("mask", _image_name("mask", mask), mask))
     elif mask is not None:
         files.append(File("mask", "mask.png", png(mask_levels(mask, shape))))
     return _form_request(files, {**_options(options), **camera}, request_id)
@@ -230,10 +256,27 @@ def _json(value: Any) -> str:
     return json.dumps(value, separators=(",", ":"))
 
 
-def _npy(cloud: NDArray[np.float32]) -> bytes:
+def _npy(array: NDArray[Any]) -> bytes:
     file = io.BytesIO()
-    np.save(file, cloud, allow_pickle=False)
+    np.save(file, array, allow_pickle=False)
     return file.getvalue()
+
+
+def _image_name(name: str, content: bytes) -> str:
+    return f"{name}.npy" if NPY.recognises(content) else f"{name}.png"
+
+
+def _beside(name: str, given: ArrayLike, count: int) -> NDArray[Any]:
+    """What belongs to each of the points, row by row."""
+    array = np.asarray(given)
+    rows = array.reshape(-1, 3) if name == "normals" and array.ndim == 3 and array.shape[2] == 3 else array
+    rows = rows.reshape(-1) if name == "view_index" else rows
+    wanted = (count, 3) if name == "normals" else (count,)
+    if array.dtype.kind not in ("iu" if name == "view_index" else "fiu") or rows.shape != wanted:
+        kind = "x, y, z" if name == "normals" else "a whole number"
+        what = f"has shape {array.shape} and dtype {array.dtype}"
+        raise InvalidArgument(name, f"{what}; give {kind} for each of the {count} points")
+    return rows.astype(np.float32) if name == "normals" else rows
 
 
 def _intrinsics(given: Intrinsics | CameraIntrinsics) -> dict[str, float]:
@@ -250,17 +293,19 @@ def _matrix(pose: Pose | ArrayLike) -> NDArray[np.float64]:
     if isinstance(pose, Pose):
         return pose.matrix
     try:
-        return Pose.from_matrix(pose).matrix
+        return Pose.nearest(pose).matrix
     except ValueError as error:
         raise InvalidArgument("T_cloud_camera", str(error)) from None
 
 
-def checked_points(points: ArrayLike) -> NDArray[np.float32]:
-    """Points (N, 3), metres, as the float32 array that is sent.
+def checked_points(points: ArrayLike) -> NDArray[np.float32] | NDArray[np.float64]:
+    """Points (N, 3), metres, as they are sent, NaN and infinities included, which the service leaves out and counts.
+
+    Those of an image (H, W, 3) come row by row. They are float32, or float64 where float32 would blur them.
 
     Raises:
-        InvalidArgument: not an array of real numbers, another shape, no point at all, or a coordinate that is NaN,
-            infinite or beyond float32.
+        InvalidArgument: not an array of real numbers, another shape, no finite point at all, or a coordinate beyond
+            float32.
     """
     try:
         array = np.asarray(points)
@@ -270,19 +315,20 @@ def checked_points(points: ArrayLike) -> NDArray[np.float32]:
         ) from None
     if array.dtype.kind not in "fiu":
         raise InvalidArgument("points", f"have dtype {array.dtype}; give real numbers: float32 or float64 metres")
-    if array.ndim != 2 or array.shape[1] != 3:
+    if array.ndim not in (2, 3) or array.shape[-1] != 3:
         raise InvalidArgument("points", f"have shape {array.shape}; give an array of N x 3: x, y, z in metres")
-    if not len(array):
-        raise InvalidArgument("points", "have 0 rows; give at least 1 point (was the whole cloud cropped away?)")
-    with np.errstate(over="ignore"):  # a coordinate beyond float32 becomes infinite and is reported below
-        cloud = np.ascontiguousarray(array, dtype=np.float32)
-    bad = int((~np.isfinite(cloud).all(axis=1)).sum())
-    if bad:
+    rows = array.reshape(-1, 3)
+    finite = np.isfinite(rows)
+    if not finite.all(axis=1).any():
         raise InvalidArgument(
             "points",
-            f"{bad} of {len(cloud)} are NaN, infinite or beyond float32; remove them (a camera marks missing depth so)",
+            f"have {len(rows)} rows, none of them finite; give at least 1 point (was all cropped away?)",
         )
-    return cloud
+    largest = float(np.abs(rows, where=finite, out=np.zeros(rows.shape)).max())
+    if largest > float(np.finfo(np.float32).max):
+        raise InvalidArgument("points", f"reach {largest:g} m, beyond float32; remove such values")
+    is_far = array.dtype.itemsize > 4 and largest >= FAR
+    return np.ascontiguousarray(rows, dtype=np.float64) if is_far else np.ascontiguousarray(rows, dtype=np.float32)
 
 
 def _options(options: Mapping[str, Any]) -> dict[str, Any]:

@@ -89,9 +89,15 @@ class _Plans:
         return ask(request, parse, timeout=seconds, policy=self._policy, clock=time.monotonic, rng=self._rng)
 
     def _grasps(
-        self, points: ArrayLike, options: Mapping[str, Any], request_id: str | None, timeout: float | None
+        self,
+        points: ArrayLike,
+        options: Mapping[str, Any],
+        beside: Mapping[str, ArrayLike | None],
+        request_id: str | None,
+        timeout: float | None,
     ) -> Conversation[GraspReply]:
-        return self._ask(points_request(points, options, request_id or uuid.uuid4().hex), grasp_reply, timeout)
+        request = points_request(points, options, request_id or uuid.uuid4().hex, **beside)
+        return self._ask(request, grasp_reply, timeout)
 
     def _grasps_from_depth(
         self,
@@ -168,6 +174,8 @@ class GraspClient(_Plans):
         self,
         points: ArrayLike,
         *,
+        view_index: ArrayLike | None = None,
+        normals: ArrayLike | None = None,
         request_id: str | None = None,
         timeout: float | None = None,
         **options: Unpack[GraspOptions],
@@ -175,12 +183,16 @@ class GraspClient(_Plans):
         """Ranked grasps on a cloud of points (N, 3), metres, best first, in the frame of the points.
 
         Args:
-            points: (N, 3) real numbers; sent as float32.
+            points: (N, 3) or, of an image, (H, W, 3) real numbers; sent as float32, or as float64 where they are far
+                from the origin. Rows with NaN or an infinity are no points.
+            view_index: (N,) which position of the option `viewpoint` saw each point, from 0.
+            normals: (N, 3) outward, zeros where there is none; they turn those that the service computes.
             request_id: names the request in the service's log; made up where absent.
             timeout: seconds in all, instead of the client's own.
             options: see `GraspOptions`; those absent or None get the service's defaults.
         """
-        return self._perform(self._grasps(points, options, request_id, timeout))
+        beside = {"view_index": view_index, "normals": normals}
+        return self._perform(self._grasps(points, options, beside, request_id, timeout))
 
     def grasps_from_depth(
         self,
@@ -190,6 +202,7 @@ class GraspClient(_Plans):
         mask: ArrayLike | bytes | None = None,
         T_cloud_camera: Pose | ArrayLike | None = None,
         depth_scale: float = DEFAULT_DEPTH_SCALE,
+        stride: int = 1,
         request_id: str | None = None,
         timeout: float | None = None,
         **options: Unpack[GraspOptions],
@@ -198,17 +211,19 @@ class GraspClient(_Plans):
 
         Args:
             depth: (height, width): whole numbers are counts of `depth_scale` metres, others are metres, rounded to it;
-                0, NaN and infinities are no depth. Or the bytes of a 16-bit grey PNG.
+                0, NaN and infinities are no depth. Or the bytes of a 16-bit grey PNG or of a .npy.
             intrinsics: the camera, in pixels.
-            mask: (height, width), not zero on what is to be grasped; or the bytes of an 8-bit grey PNG.
-            T_cloud_camera: camera pose, 4 x 4; camera axes are +x right, +y down, +z forward. Without it the grasps are
-                in the frame of the camera.
+            mask: (height, width), not zero on what is to be grasped, or labels for the option `target`; or the bytes
+                of a grey PNG of 8 or 16 bits or of a .npy.
+            T_cloud_camera: camera pose, 4 x 4, of three decimals or more; camera axes are +x right, +y down, +z
+                forward. Without it the grasps are in the frame of the camera.
             depth_scale: metres per count.
+            stride: every so many-th row and column is used.
             request_id: names the request in the service's log; made up where absent.
             timeout: seconds in all, instead of the client's own.
             options: see `GraspOptions`; the default viewpoint is the camera's.
         """
-        image = {"mask": mask, "T_cloud_camera": T_cloud_camera, "depth_scale": depth_scale}
+        image = {"mask": mask, "T_cloud_camera": T_cloud_camera, "depth_scale": depth_scale, "stride": stride}
         return self._perform(self._grasps_from_depth(depth, intrinsics, options, image, request_id, timeout))
 
     def model(self, *, timeout: float | None = None) -> ModelReply:
@@ -300,12 +315,15 @@ class AsyncGraspClient(_Plans):
         self,
         points: ArrayLike,
         *,
+        view_index: ArrayLike | None = None,
+        normals: ArrayLike | None = None,
         request_id: str | None = None,
         timeout: float | None = None,
         **options: Unpack[GraspOptions],
     ) -> GraspReply:
         """As `GraspClient.grasps`."""
-        return await self._perform(self._grasps(points, options, request_id, timeout))
+        beside = {"view_index": view_index, "normals": normals}
+        return await self._perform(self._grasps(points, options, beside, request_id, timeout))
 
     async def grasps_from_depth(
         self,
@@ -315,12 +333,13 @@ class AsyncGraspClient(_Plans):
         mask: ArrayLike | bytes | None = None,
         T_cloud_camera: Pose | ArrayLike | None = None,
         depth_scale: float = DEFAULT_DEPTH_SCALE,
+        stride: int = 1,
         request_id: str | None = None,
         timeout: float | None = None,
         **options: Unpack[GraspOptions],
     ) -> GraspReply:
         """As `GraspClient.grasps_from_depth`."""
-        image = {"mask": mask, "T_cloud_camera": T_cloud_camera, "depth_scale": depth_scale}
+        image = {"mask": mask, "T_cloud_camera": T_cloud_camera, "depth_scale": depth_scale, "stride": stride}
         return await self._perform(self._grasps_from_depth(depth, intrinsics, options, image, request_id, timeout))
 
     async def model(self, *, timeout: float | None = None) -> ModelReply:

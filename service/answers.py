@@ -154,6 +154,7 @@ def _meta(result: GraspResult, model: ModelInfo, timings_ms: Mapping[str, float]
         "model": {"name": model.name, "version": model.version, "weights_sha256": model.weights_sha256},
         "counts": {
             "points": counts.points,
+            "ignored_points": counts.ignored_points,
             "prepared_points": counts.prepared_points,
             "candidates": counts.candidates,
             "collision_free": counts.collision_free,

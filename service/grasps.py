@@ -149,7 +149,8 @@ class GraspEndpoint:
         """
         with self._admitted(request):
             asked, _ = await self._read(request, self.reader(request))
-            return Response(asked.query.points.astype("<f4").tobytes(), media_type=OCTET_STREAM)
+            points = asked.query.points + asked.query.offset
+            return Response(points.astype("<f4").tobytes(), media_type=OCTET_STREAM)
 
     @contextmanager
     def _admitted(self, request: Request) -> Iterator[float]:
@@ -240,7 +241,7 @@ class GraspEndpoint:
             payload = decode(body, self._settings.max_points)
             options = parse_options(merged(url_options, payload.options), self._settings.max_points)
             model = chosen_model(options, self._worker.models)
-            query = build_query(payload, options)
+            query = build_query(payload, options, self._settings.max_points)
             check_hand(query, model)
 
             def write(result: GraspResult, timings_ms: Mapping[str, float]) -> Response:

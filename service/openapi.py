@@ -12,6 +12,7 @@ from service.answers import NPZ
 from service.errors import PROBLEM_JSON, PROBLEMS, ClientGone, UnknownModel
 from service.payloads import JSON, MULTIPART, NPY, OCTET_STREAM
 from service.schemas import MAX_TIMEOUT_S, DepthOptions, GraspOptions, GraspRequest, GraspResponse, Problem
+from tesnet import formats
 
 REF = "#/components/schemas/{model}"
 
@@ -125,7 +126,7 @@ def _grasps(options: dict[str, Any]) -> dict[str, Any]:
                     "schema": {
                         "type": "string",
                         "format": "binary",
-                        "description": "A .npy array (N, 3) of float32 or float64 in metres; never unpickled.",
+                        "description": f"A .npy: {formats.NPY.what}, in metres; never unpickled.",
                     }
                 },
                 MULTIPART: {"schema": _form(), "encoding": {"options": {"contentType": JSON}}},
@@ -158,10 +159,15 @@ def _grasps(options: dict[str, Any]) -> dict[str, Any]:
 
 def _form() -> dict[str, Any]:
     """The schema of a multipart body."""
+    readers = "; ".join(f"{', '.join(entry.suffixes)} ({entry.what})" for entry in formats.FORMATS)
     files = {
-        "cloud": "A .npy, .ply or .pcd file (text, binary; binary_compressed .pcd too); either this or `depth`.",
-        "depth": "A depth image, 16-bit grey PNG, 0 where there is no depth; `options` holds its camera.",
-        "mask": "With `depth`: an 8-bit grey PNG of the same size, non-zero on the target.",
+        "cloud": f"A file of one of these formats: {readers}. Either this or `depth`.",
+        "depth": "A depth image: 16-bit grey PNG, or a .npy of counts as whole numbers or of metres as floating "
+        "point; 0 or NaN where there is no depth. `options` holds its camera.",
+        "mask": "With `depth`: a grey PNG of 8 or 16 bits or a .npy of the same size; non-zero on the target, or "
+        "labels.",
+        "view_index": "A .npy of whole numbers: which `viewpoint` saw each point, from 0.",
+        "normals": "A .npy of float32 or float64 (N, 3): outward normals of the points, zeros where there is none.",
     }
     return {
         "type": "object",

@@ -58,7 +58,7 @@ class Separation(RequestPart):
 
 
 class Target(RequestPart):
-    """Where to grasp: a box, or some of the points. Exactly one of the two."""
+    """Where to grasp: a box, some of the points, or what a mask labels. Exactly one of the three."""
 
     box: Box | None = Field(default=None, description="Approach and contact point lie in this box.")
     indices: Sequence[Annotated[int, Field(ge=0, lt=2**31)]] | None = Field(
@@ -66,11 +66,14 @@ class Target(RequestPart):
         description="Numbers of the target's points, from 0: rows of the posted cloud, or pixels of a depth image row "
         "by row. Mark all points of the object: a cell of the voxel grid is the target's where half of its points are.",
     )
+    label: Annotated[int, Field(ge=0, le=65_535)] | None = Field(
+        default=None, description="Number of the target's pixels in the file `mask`, which comes with a depth image."
+    )
 
     @model_validator(mode="after")
-    def _one_of_two(self) -> Target:
-        if (self.box is None) == (self.indices is None):
-            raise ValueError("give either `box` or `indices`")
+    def _one_of_three(self) -> Target:
+        if sum(value is not None for value in (self.box, self.indices, self.label)) != 1:
+            raise ValueError("give either `box` or `indices`, or `label` beside a mask")
         return self
 
 
@@ -166,8 +169,8 @@ class GraspOptions(RequestPart):
     target: Target | None = Field(
         default=None,
         description='Where to grasp: {"box": {"min": [x, y, z], "max": [x, y, z]}} or {"indices": [whole numbers]}, '
-        "the posted points by their number from 0. Candidates come from it alone; the other points still count for "
-        "collision. Default: everything.",
+        'the posted points by their number from 0, or {"label": whole number} of a mask. Candidates come from it '
+        "alone; the other points still count for collision. Default: everything.",
     )
     approach: Approach | None = Field(
         default=None,
@@ -225,6 +228,16 @@ class GraspRequest(GraspOptions):
     """Body of `POST /grasps` as `application/json`. `service.payloads` decodes the points, not this model."""
 
     points: list[Vector] = Field(description="The point cloud: [[x, y, z], ...] in metres, finite.")
+    view_index: list[Annotated[int, Field(ge=0, lt=MAX_VIEWPOINTS)]] | None = Field(
+        default=None,
+        description="Which of the positions of `viewpoint` saw each point, from 0; turns its normal. Default: the one "
+        "most nearly along the normal.",
+    )
+    normals: list[Vector] | None = Field(
+        default=None,
+        description="Normals [[x, y, z], ...] of the points, outward, of any length, zeros where there is none; turn "
+        "the normals that are computed. Default: none.",
+    )
 
 
 class Intrinsics(RequestPart):
@@ -243,9 +256,13 @@ class DepthCamera(RequestPart):
     T_cloud_camera: Matrix | None = Field(
         default=None,
         description="Camera pose as a 4 x 4 matrix, row by row; camera axes are +x right, +y down, +z forward. "
-        "Default: the cloud frame is the camera frame.",
+        "Rounded ones are made orthonormal, where R R^T differs from the identity by at most 0.005. Default: the cloud "
+        "frame is the camera frame.",
     )
     depth_scale: float = Field(default=0.001, gt=0, le=1, description="Metres per count, more than 0, at most 1.")
+    stride: int = Field(
+        default=1, ge=1, le=64, description="Every so many-th row and column of the image is used, 1 to 64."
+    )
 
 
 class DepthOptions(GraspOptions, DepthCamera):
@@ -313,7 +330,8 @@ class RejectedOut(ResponsePart):
 class CountsOut(ResponsePart):
     """The account of points and candidates: what each step left."""
 
-    points: int = Field(description="Points in the request.")
+    points: int = Field(description="Points in the request: finite ones, and pixels with a depth.")
+    ignored_points: int = Field(default=0, description="Rows of the request with NaN or an infinity, left out.")
     prepared_points: int = Field(description="Points left by crop, voxel grid and outlier removal.")
     candidates: int = Field(description="Candidates found.")
     collision_free: int = Field(description="Candidates whose hand does not collide.")

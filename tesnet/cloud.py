@@ -65,7 +65,7 @@ class PreparedCloud:
 
     Args:
         points: (P, 3).
-        normals: (P, 3) unit, outward: turned towards the viewpoint that sees the point best.
+        normals: (P, 3) unit, outward: turned as the query tells (`orient_normals`).
         neighbours: (P, k) indices of the nearest points, the point itself first.
         spectrum: (P, 2) the smaller two eigenvalues of the local covariance, each divided by the sum of the three.
         view_directions: (P, 3) unit, from the point to that viewpoint.
@@ -102,7 +102,7 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
 
     A support height that is still to be found (`tesnet.support`) counts as none.
     """
-    table = crop(_with_target(query).to(device), query)
+    table = crop(_columns(query).to(device), query)
     if len(table) == 0:
         return None
     near = (table[:, :3] - table[:, :3].median(dim=0).values).norm(dim=1) <= config.max_extent
@@ -122,6 +122,7 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     table = voxel_downsample(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config.voxel_size)
     viewpoints = to_canonical(viewpoints).to(device)
     on_target = _on_target(query, table, T_cloud_canonical)
+    outward = None if _outward(query) is None else table[:, -3:] @ rotation.to(table)
     points = table[:, :3].contiguous()
     dropped_surplus = max(0, len(points) - config.max_points)
     if dropped_surplus:
@@ -129,13 +130,15 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
         distance = (points - wanted.median(dim=0).values).norm(dim=1)
         kept = distance.argsort(stable=True)[: config.max_points].sort().values
         points, on_target = points[kept], None if on_target is None else on_target[kept]
+        outward = None if outward is None else outward[kept]
 
     neighbours = nearest_neighbours(points, max(config.normal_neighbours, config.outlier_neighbours + 1))
     keep = ~statistical_outliers(points, neighbours[:, : config.outlier_neighbours + 1], config.outlier_std_ratio)
     points, neighbours = drop_points(points, neighbours, keep)
     on_target = None if on_target is None else on_target[keep]
+    outward = None if outward is None else outward[keep]
     normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
-    normals, view_directions = orient_normals(points, normals, viewpoints)
+    normals, view_directions = orient_normals(points, normals, viewpoints, outward)
     support_height = None
     if query.up is not None and isinstance(query.support_height, float):
         support_height = float(query.support_height - T_cloud_canonical.translation @ query.up)
@@ -156,12 +159,25 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     )
 
 
-def _with_target(query: GraspQuery) -> Tensor:
-    """The query's points (N, 3) or, where its target is a mask, (N, 4) with 1 in the last column for the target."""
-    points = torch.from_numpy(query.points.copy())
-    if query.target is None or isinstance(query.target, Box):
-        return points
-    return torch.cat([points, torch.from_numpy(query.target.copy()).to(points.dtype)[:, None]], dim=1)
+def _columns(query: GraspQuery) -> Tensor:
+    """A row for each of the query's points: x, y, z; 1 on the target, where that is a mask; `_outward`, where known."""
+    columns = [torch.from_numpy(query.points.copy())]
+    if query.target is not None and not isinstance(query.target, Box):
+        columns.append(torch.from_numpy(query.target.copy()).to(columns[0].dtype)[:, None])
+    outward = _outward(query)
+    if outward is not None:
+        columns.append(outward)
+    return torch.cat(columns, dim=1)
+
+
+def _outward(query: GraspQuery) -> Tensor | None:
+    """Directions (N, 3) out of the surface: the query's normals or, without these, from each point to who saw it."""
+    if query.normals is not None:
+        return torch.nn.functional.normalize(torch.from_numpy(query.normals.copy()), dim=1)
+    if query.view_index is None or query.viewpoints is None:
+        return None
+    to_viewer = query.viewpoints[query.view_index] - query.points
+    return torch.nn.functional.normalize(torch.from_numpy(to_viewer), dim=1).float()
 
 
 def crop(points: Tensor, query: GraspQuery) -> Tensor:

@@ -149,14 +149,30 @@ def estimate_normals(points: Tensor, neighbours: Tensor, radius: float) -> tuple
     return normals.to(points.dtype), spectrum.to(points.dtype)
 
 
-def orient_normals(points: Tensor, normals: Tensor, viewpoints: Tensor) -> tuple[Tensor, Tensor]:
-    """Normals (P, 3) turned towards, and unit directions (P, 3) to, the viewpoint (of V, 3) most nearly along each."""
+_LEAST_OUTWARD = 0.1
+"""Length of the mean of unit vectors that say nothing together."""
+
+
+def orient_normals(
+    points: Tensor, normals: Tensor, viewpoints: Tensor, outward: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Normals (P, 3) turned outward, and unit directions (P, 3) to the viewpoint that sees each point.
+
+    Where a direction out of the surface is given (`outward` (P, 3), zeros where not), normals are turned along it and
+    the viewpoint (of V, 3) is the one most nearly in it; elsewhere both are those of the viewpoint most nearly along
+    the normal's line.
+    """
     to_viewpoints = viewpoints[None] - points[:, None]
     directions = to_viewpoints / to_viewpoints.norm(dim=2, keepdim=True).clamp(min=1e-9)
     alignment = (directions * normals[:, None]).sum(dim=2)
     best = alignment.abs().argmax(dim=1)
     rows = torch.arange(len(points), device=points.device)
-    sign = torch.where(alignment[rows, best] < 0, -1.0, 1.0)
+    along = alignment[rows, best]
+    if outward is not None:
+        told = outward.norm(dim=1) > _LEAST_OUTWARD
+        best = torch.where(told, (directions * outward[:, None]).sum(dim=2).argmax(dim=1), best)
+        along = torch.where(told, (normals * outward).sum(dim=1), along)
+    sign = torch.where(along < 0, -1.0, 1.0)
     return normals * sign[:, None], directions[rows, best]
 
 

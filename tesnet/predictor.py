@@ -11,11 +11,11 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from tesnet import candidates, cloud, collision, networks, ranking, support, weights
+from tesnet import candidates, cloud, collision, networks, plausibility, ranking, support, weights
 from tesnet.errors import DeviceError, GaveUp, WeightsError
-from tesnet.geometry import PANDA, Box, GraspSet, Gripper
+from tesnet.geometry import PANDA, Box, GraspSet, Pose
 from tesnet.networks import Network
-from tesnet.query import MAX_SEED, GraspQuery
+from tesnet.query import MAX_SEED, NO_VIEWPOINT, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 
 COARSEST_RESOLUTION = 0.0005
@@ -172,19 +172,21 @@ class GraspPredictor:
         clock = _Clock(give_up)
         rejected = dict.fromkeys(REJECTIONS, 0)
         notes = _query_warnings(query)
-        if query.support_height == "auto":
+        found_support = query.support_height == "auto"
+        if found_support:
             query, note = support.settled(query, self.device)
             notes.append(note)
+        notes += _support_warnings(query)
 
         clock.check()
         prepared = cloud.prepare(query, self._preparation, self.device)
         self._synchronise()
         clock.lap("prepare")
         if prepared is not None:
-            notes += _cloud_warnings(prepared, self._preparation)
+            notes += _cloud_warnings(prepared, query, self._preparation)
         if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
             count = 0 if prepared is None else len(prepared)
-            outside = prepared is None and len(query.points) > 0
+            outside = prepared is None and len(query.points) > 0 and not (found_support and query.workspace is None)
             reason: Reason = "no_points_in_workspace" if outside else "too_few_points"
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
         notes += _target_warnings(prepared, query, self._preparation)
@@ -195,6 +197,7 @@ class GraspPredictor:
         if len(found.free) == 0:
             reason = "all_in_collision" if found.count else "no_candidates"
             sizes = (len(prepared), found.count, 0)
+            notes += _answer_warnings(0.0, prepared, query)
             return _nothing(query, reason, sizes, rejected | found.rejected, notes, clock)
         return _Proposal(query, prepared, found, notes, clock)
 
@@ -235,13 +238,13 @@ class GraspPredictor:
         )
         last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
         rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
-        grasps = _grasps(prepared, found.free, scores, ranked.indices, query.gripper)
+        grasps = _grasps(query, prepared, found.free, scores, ranked.indices)
         clock.lap("rank")
         return GraspResult(
             grasps=grasps,
-            counts=GraspCounts(len(query.points), len(prepared), found.count, len(found.free), len(grasps), rejected),
+            counts=_counts(query, (len(prepared), found.count, len(found.free), len(grasps)), rejected),
             reason=None if len(grasps) else "below_min_score",
-            warnings=tuple(proposal.notes),
+            warnings=(*proposal.notes, *_answer_warnings(float(scores.max()), prepared, query)),
             timings_ms=clock.laps_ms,
         )
 
@@ -376,9 +379,9 @@ def _device(name: str) -> torch.device:
 
 
 def _query_warnings(query: GraspQuery) -> list[str]:
-    notes = []
+    notes = list(query.notes)
     if query.viewpoints is None:
-        notes.append("viewpoint not given: the camera is taken to be at the origin of the cloud frame")
+        notes.append(NO_VIEWPOINT)
     if query.up is None:
         notes.append("up not given: grasps from below are not filtered, only those that come from behind what is seen")
     if query.gripper != PANDA:
@@ -398,8 +401,29 @@ def _target_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: c
     return [note]
 
 
-def _cloud_warnings(prepared: cloud.PreparedCloud, config: cloud.PreparationConfig) -> list[str]:
-    notes = []
+def _support_warnings(query: GraspQuery) -> list[str]:
+    if query.up is None or query.viewpoints is None or not isinstance(query.support_height, float):
+        return []
+    note = plausibility.reversed_up(query.viewpoints @ query.up, query.support_height)
+    return [] if note is None else [note]
+
+
+def _answer_warnings(best: float, prepared: cloud.PreparedCloud, query: GraspQuery) -> list[str]:
+    return plausibility.answer_notes(best, prepared.points.cpu().numpy(), query.gripper.max_width)
+
+
+def _point_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
+    points = prepared.points
+    spacing = float((points - points[prepared.neighbours[:, 1]]).norm(dim=1).median())
+    notes = plausibility.cloud_notes(points.cpu().numpy(), spacing, config.voxel_size)
+    if query.viewpoints is not None:
+        enclosed = (plausibility.enclosed_viewpoint(query.points, viewpoint) for viewpoint in query.viewpoints)
+        notes += [note for note in enclosed if note is not None]
+    return notes
+
+
+def _cloud_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
+    notes = _point_warnings(prepared, query, config) if len(prepared) >= cloud.MINIMUM_POINTS else []
     distance = float(np.abs(prepared.T_cloud_canonical.translation).max())
     resolution = float(np.spacing(np.float32(distance)))
     if resolution > COARSEST_RESOLUTION:
@@ -427,25 +451,29 @@ def _nothing(
     notes: list[str],
     clock: _Clock,
 ) -> GraspResult:
-    counts = GraspCounts(len(query.points), *sizes, 0, rejected)
+    counts = _counts(query, (*sizes, 0), rejected)
     return GraspResult(GraspSet.empty(query.gripper), counts, reason, tuple(notes), clock.laps_ms)
 
 
+def _counts(query: GraspQuery, sizes: tuple[int, int, int, int], rejected: dict[str, int]) -> GraspCounts:
+    return GraspCounts(len(query.points), *sizes, rejected, query.ignored_points)
+
+
 def _grasps(
+    query: GraspQuery,
     prepared: cloud.PreparedCloud,
     free: candidates.Candidates,
     scores: torch.Tensor,
     indices: torch.Tensor,
-    hand: Gripper,
 ) -> GraspSet:
-    """The candidates at the indices (M,), back in the frame of the query, for an open hand."""
+    """The candidates at the indices (M,), back in the frame of the caller, for a hand that is wide open."""
     chosen = free.select(indices.to(scores.device))
-    to_cloud = prepared.T_cloud_canonical
+    to_cloud = Pose(np.eye(3), query.offset) @ prepared.T_cloud_canonical
     return GraspSet(
         scores=scores[indices.to(scores.device)].cpu().double().numpy(),
         Ts_cloud_grasp=to_cloud.matrix @ chosen.Ts_canonical_grasp.cpu().double().numpy(),
-        widths=np.full(len(indices), hand.max_width),
+        widths=np.full(len(indices), query.gripper.max_width),
         approach_points=to_cloud.apply(prepared.points[chosen.approach].cpu().numpy()),
         contact_points=to_cloud.apply(prepared.points[chosen.contact].cpu().numpy()),
-        gripper=hand,
+        gripper=query.gripper,
     )

@@ -24,6 +24,11 @@ MAX_DIAGONAL = 20.0
 """Metres; a cloud whose central 90 % spans more was not given in metres."""
 MAX_DISTANCE = 1e9
 """Metres from the origin at which viewpoints and support planes still count as given in metres."""
+FAR = 64.0
+"""Metres from the origin from which on float32 rounds coordinates by 4 micrometres or more."""
+NO_VIEWPOINT = "viewpoint not given: the camera is taken to be at the origin of the cloud frame"
+_SPAN_SAMPLE = 1_000_000
+"""Of larger clouds the span is that of every n-th point, about so many."""
 
 
 Target: TypeAlias = Box | NDArray[np.bool_]
@@ -33,6 +38,10 @@ Target: TypeAlias = Box | NDArray[np.bool_]
 @dataclass(frozen=True, eq=False, slots=True)
 class GraspQuery:
     """A point cloud and what is wanted of its grasps; the defaults are those of the HTTP interface.
+
+    A cloud of float64 over 64 m from the origin would lose its detail in float32. Where `origin` is left out, the
+    middle of such a cloud becomes the origin, and everything that is given here is moved along with it. So a query
+    lies in one frame near the cloud, and its answers are moved back to that of the caller.
 
     Args:
         points: (N, 3) metres; stored as float32.
@@ -49,6 +58,11 @@ class GraspQuery:
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
         seed: makes sampling repeatable.
         model: the network that shall answer, where several are loaded; None for the first of them.
+        view_index: (N,) which of the viewpoints saw each point, from 0; turns normals.
+        normals: (N, 3) outward, of any length, a row of zeros where there is none; turn ours.
+        origin: (3,) of this query's frame in that of the caller, whose axes are the same; None where they are one.
+        ignored_points: how many were posted that are not finite and not among `points`.
+        notes: what the caller is to be told about how these points came to be.
 
     Raises:
         InvalidQuery: names the field and gives the value, the limit and the remedy.
@@ -71,22 +85,21 @@ class GraspQuery:
     unseen: Literal["free", "occupied"] = "free"
     seed: int = 0
     model: str | None = None
+    view_index: NDArray[np.uint8] | None = None
+    normals: NDArray[np.float32] | None = None
+    origin: NDArray[np.float64] | None = None
+    ignored_points: int = 0
+    notes: tuple[str, ...] = ()
 
     @property
     def nbytes(self) -> int:
         """Bytes of its arrays that grow with the cloud."""
-        return self.points.nbytes + (self.target.nbytes if isinstance(self.target, np.ndarray) else 0)
+        arrays = (self.points, self.target, self.view_index, self.normals)
+        return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def __post_init__(self) -> None:
-        object.__setattr__(self, "points", _cloud(self.points))
         if self.viewpoints is not None:
-            array = _numbers("viewpoint", self.viewpoints)
-            viewpoints = _vector("viewpoint", array[None] if array.ndim == 1 else array, (-1, 3))
-            object.__setattr__(self, "viewpoints", viewpoints)
-            if not 1 <= len(viewpoints) <= MAX_VIEWPOINTS:
-                raise InvalidQuery("viewpoint", f"has {len(viewpoints)} positions; give 1 to {MAX_VIEWPOINTS}")
-            farthest = float(np.abs(viewpoints).max())
-            _in_range("viewpoint", farthest, 0, MAX_DISTANCE, " m from the origin")
+            object.__setattr__(self, "viewpoints", _viewpoints(self.viewpoints))
         if self.up is not None:
             object.__setattr__(self, "up", _direction("up", self.up))
         if self.support_height is not None:
@@ -95,13 +108,13 @@ class GraspQuery:
             if self.support_height != "auto":
                 _in_range("support_height", self.support_height, -MAX_DISTANCE, MAX_DISTANCE, " m, or be auto")
                 object.__setattr__(self, "support_height", float(self.support_height))
-        if self.target is not None and not isinstance(self.target, Box):
-            object.__setattr__(self, "target", _mask(self.target, len(self.points)))
-        _check_gripper(self.gripper)
         for name, kind in (("workspace", Box), ("approach", ApproachCone)):
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InvalidQuery(name, f"is of type {type(value).__name__}; give a {kind.__name__} or None")
+        self._take_points()
+        self._take_what_belongs_to_points()
+        _check_gripper(self.gripper)
         _whole_in_range("max_grasps", self.max_grasps, 1, MAX_GRASPS)
         _in_range("min_score", self.min_score, 0, 1)
         _in_range("min_separation", self.separation_translation, 0, 1, " m")
@@ -111,6 +124,85 @@ class GraspQuery:
         _whole_in_range("seed", self.seed, 0, MAX_SEED)
         if self.unseen not in ("free", "occupied"):
             raise InvalidQuery("unseen", f"is {self.unseen!r}; valid: free, occupied")
+
+    @property
+    def offset(self) -> NDArray[np.float64]:
+        """(3,) what moves positions of this query to the frame of the caller: `origin`, or zero."""
+        return np.zeros(3) if self.origin is None else self.origin
+
+    def _take_what_belongs_to_points(self) -> None:
+        count = len(self.points)
+        if self.target is not None and not isinstance(self.target, Box):
+            object.__setattr__(self, "target", _mask(self.target, count))
+        if self.view_index is not None:
+            viewpoints = 1 if self.viewpoints is None else len(self.viewpoints)
+            object.__setattr__(self, "view_index", _view_index(self.view_index, count, viewpoints))
+        if self.normals is not None:
+            object.__setattr__(self, "normals", _normals(self.normals, count))
+
+    def _take_points(self) -> None:
+        """Keep the points as float32, near the origin; where that is chosen here, move what else has a place."""
+        if self.origin is not None:
+            object.__setattr__(self, "origin", _vector("origin", self.origin, (3,)))
+            object.__setattr__(self, "points", _cloud(self.points, np.zeros(3)))
+            return
+        origin = _middle(self.points)
+        object.__setattr__(self, "points", _cloud(self.points, origin))
+        if origin.any():
+            origin.setflags(write=False)
+            object.__setattr__(self, "origin", origin)
+            self._move(origin)
+
+    def _move(self, origin: NDArray[np.float64]) -> None:
+        """Tell positions from a new origin."""
+        if self.viewpoints is None:
+            object.__setattr__(self, "notes", (*self.notes, NO_VIEWPOINT))
+        for name in ("workspace", "target"):
+            box = getattr(self, name)
+            if isinstance(box, Box):
+                object.__setattr__(self, name, Box(box.minimum - origin, box.maximum - origin))
+        object.__setattr__(
+            self, "viewpoints", (np.zeros((1, 3)) if self.viewpoints is None else self.viewpoints) - origin
+        )
+        if isinstance(self.support_height, float) and self.up is not None:
+            object.__setattr__(self, "support_height", self.support_height - float(self.up @ origin))
+
+
+def _viewpoints(given: ArrayLike) -> NDArray[np.float64]:
+    array = _numbers("viewpoint", given)
+    viewpoints = _vector("viewpoint", array[None] if array.ndim == 1 else array, (-1, 3))
+    if not 1 <= len(viewpoints) <= MAX_VIEWPOINTS:
+        raise InvalidQuery("viewpoint", f"has {len(viewpoints)} positions; give 1 to {MAX_VIEWPOINTS}")
+    _in_range("viewpoint", float(np.abs(viewpoints).max()), 0, MAX_DISTANCE, " m from the origin")
+    return viewpoints
+
+
+def _view_index(given: ArrayLike, count: int, viewpoints: int) -> NDArray[np.uint8]:
+    index = np.asarray(given)
+    if index.dtype.kind not in "iu" or index.shape != (count,):
+        raise InvalidQuery(
+            "view_index",
+            f"is an array of {index.dtype} of shape {index.shape}; give a whole number for each of the {count} points",
+        )
+    if count and not 0 <= index.min() <= index.max() < viewpoints:
+        raise InvalidQuery(
+            "view_index",
+            f"reaches from {index.min()} to {index.max()}, but there are {viewpoints} viewpoints; count them from 0",
+        )
+    array = index.astype(np.uint8)
+    array.setflags(write=False)
+    return array
+
+
+def _normals(given: ArrayLike, count: int) -> NDArray[np.float32]:
+    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
+        array = np.array(_numbers("normals", given), dtype=np.float32)
+    if array.shape != (count, 3):
+        raise InvalidQuery("normals", f"have shape {array.shape}; give x, y, z for each of the {count} points")
+    if not np.isfinite(array).all():
+        raise InvalidQuery("normals", "hold NaN or an infinity; give zeros where there is no normal")
+    array.setflags(write=False)
+    return array
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -147,24 +239,35 @@ def _check_gripper(gripper: Any) -> None:
         )
 
 
-def _cloud(points: ArrayLike) -> NDArray[np.float32]:
-    with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite and is refused below
-        array = np.array(_numbers("points", points), dtype=np.float32)
-    if array.ndim != 2 or array.shape[1] != 3:
-        raise InvalidQuery("points", f"have shape {array.shape}; give an array of N x 3: x, y, z in metres")
-    if not np.isfinite(array).all():
-        bad = int((~np.isfinite(array).all(axis=1)).sum())
+def _middle(points: ArrayLike) -> NDArray[np.float64]:
+    """(3,) origin of the frame in which points are kept: zero, unless float32 would blur what is more precise."""
+    array = _numbers("points", points)
+    if array.dtype == np.float32 or array.ndim != 2 or array.shape[1:] != (3,) or not len(array):
+        return np.zeros(3)
+    middle = np.median(array[:: 1 + len(array) // _SPAN_SAMPLE], axis=0).astype(np.float64).round()
+    return middle if FAR <= np.abs(middle).max() <= MAX_DISTANCE else np.zeros(3)
+
+
+def _cloud(points: ArrayLike, origin: NDArray[np.float64]) -> NDArray[np.float32]:
+    given = _numbers("points", points)
+    if given.ndim != 2 or given.shape[1] != 3:
+        raise InvalidQuery("points", f"have shape {given.shape}; give an array of N x 3: x, y, z in metres")
+    with np.errstate(over="ignore", invalid="ignore"):  # what float32 cannot hold is infinite, and refused below
+        array = np.array(given - origin if origin.any() else given, dtype=np.float32)
+    finite = np.isfinite(array).all(axis=1)
+    if not finite.all():
         raise InvalidQuery(
-            "points", f"{bad} of {len(array)} are NaN or infinite; remove them (a camera marks missing depth so)"
+            "points",
+            f"{np.count_nonzero(~finite)} of {len(array)} are NaN or infinite; remove them (a camera marks missing "
+            "depth so)",
         )
     if len(array):
-        low, high = np.percentile(array, [5, 95], axis=0, method="nearest").astype(np.float64)
-        diagonal = float(np.linalg.norm(high - low))
+        diagonal = span(array)
         if diagonal > MAX_DIAGONAL:
             raise InvalidQuery(
                 "points",
                 f"span {diagonal:.0f} m (diagonal of the central 90 %; limit {MAX_DIAGONAL:g} m); "
-                "coordinates must be in metres: divide millimetres by 1000",
+                "coordinates must be in metres: divide millimetres by 1000, centimetres by 100, inches by 39.37",
             )
     array.setflags(write=False)
     return array
@@ -224,3 +327,10 @@ def _whole_in_range(field: str, value: Any, low: int, high: int) -> None:
     if not isinstance(value, (int, np.integer)) or not low <= value <= high:
         shown = value if isinstance(value, (int, float, np.number)) else f"of type {type(value).__name__}"
         raise InvalidQuery(field, f"is {shown}; it must be a whole number between {low} and {high}")
+
+
+def span(points: NDArray[Any]) -> float:
+    """Metres: the diagonal of the box that holds the central 90 % of points (N, 3) on each axis."""
+    sample = points[:: 1 + len(points) // _SPAN_SAMPLE]
+    low, high = np.percentile(sample, [5, 95], axis=0, method="nearest").astype(np.float64)
+    return float(np.linalg.norm(high - low))

@@ -16,7 +16,10 @@ REJECTIONS = ("support", "from_below", "approach", "target", "collision", "min_s
 
 @dataclass(frozen=True, slots=True)
 class GraspCounts:
-    """How many points and candidates each step left; `rejected` has every name of `REJECTIONS`."""
+    """How many points and candidates each step left; `rejected` has every name of `REJECTIONS`.
+
+    `ignored_points` were posted, but are not finite and not among `points`.
+    """
 
     points: int
     prepared_points: int
@@ -24,6 +27,7 @@ class GraspCounts:
     collision_free: int
     returned: int
     rejected: Mapping[str, int]
+    ignored_points: int = 0
 
 
 @dataclass(frozen=True, slots=True)

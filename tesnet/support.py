@@ -50,7 +50,9 @@ def settled(query: GraspQuery, device: torch.device) -> tuple[GraspQuery, str]:
     if plane is None:
         note = "support_height auto: no plane across up was found, so no support is kept clear: give the height, or up"
         return replace(query, support_height=None), note
-    note = f"support_height auto: the plane at {plane.height:.4f} m along up, {plane.share:.0%} of what is seen"
+    assert query.up is not None, "GraspQuery sees to it"
+    height = plane.height + float(query.up @ query.offset)
+    note = f"support_height auto: the plane at {height:.4f} m along up, {plane.share:.0%} of what is seen"
     return replace(query, support_height=plane.height), note
 
 

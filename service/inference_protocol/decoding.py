@@ -10,22 +10,24 @@ from typing import Any
 
 import msgspec
 import numpy as np
+from numpy.typing import NDArray
 
 from service.errors import Invalid, Undecodable, shortened
-from service.inference_protocol.tensors import BINARY_OUTPUT, HEADER_LENGTH, INPUT, OUTPUTS
+from service.inference_protocol.tensors import BINARY_OUTPUT, HEADER_LENGTH, INPUT, INPUTS, OUTPUTS
 from service.payloads import Payload, parse_options
-from service.payloads.json_body import points_of_json
 from service.payloads.json_object import (
     Span,
     broken_chunk,
     members,
     number_chunks,
-    only_element,
+    objects,
     refuse_twice,
     undecodable,
 )
+from service.payloads.json_points import points_of_json
 from service.payloads.options import json_text, option_texts, unknown_option
-from service.payloads.payload import Points, as_float32, check_count, refuse_empty
+from service.payloads.payload import BesidePoints, check_count, cloud_payload, kept, most_rows, refuse_empty
+from service.payloads.per_point import known_normals
 from service.schemas import GraspOptions
 
 _FIELDS = ("id", "parameters", "inputs", "outputs")
@@ -45,7 +47,7 @@ class _Input(msgspec.Struct, forbid_unknown_fields=True):
     """An input, but for its data."""
 
     name: str
-    shape: tuple[int, int]
+    shape: tuple[int, ...]
     datatype: str
     parameters: _InputParameters | None = None
 
@@ -62,6 +64,12 @@ class _Output(msgspec.Struct, forbid_unknown_fields=True):
 _PARAMETERS = (*GraspOptions.model_fields, BINARY_OUTPUT, _TIMEOUT, *_UNSUPPORTED)
 _NESTED = re.compile(rb"\[\s*\[")
 _NUMBERS = msgspec.json.Decoder(list[float])
+_WHOLE_NUMBERS = msgspec.json.Decoder(list[int])
+_WHOLE: Mapping[str, str] = {
+    f"{sign}INT{8 * size}": f"<{sign.lower() or 'i'}{size}" for sign in ("", "U") for size in (1, 2, 4, 8)
+}
+"""The protocol's names of whole numbers, and numpy's."""
+_EXPECTED = ", ".join(f"{tensor.name} {tensor.datatype} {tensor.shape}" for tensor in INPUTS) + " (the first at least)"
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -106,8 +114,10 @@ def decode(body: bytearray, head_length: int | None, max_points: int) -> InferRe
     timeout = _timeout(parameters.pop(_TIMEOUT, None))
     outputs = _outputs(fields.get("outputs"), all_binary == b"true")
     identity = _bounded(fields["id"], "id", str) if "id" in fields else ""
-    points = _points(fields.get("inputs"), memoryview(body)[head:], max_points)
-    return InferRequest(Payload(points), parse_options(parameters, max_points), outputs, identity, timeout)
+    arrays = _arrays(fields.get("inputs"), memoryview(body)[head:], max_points)
+    return InferRequest(
+        _payload(arrays, is_binary=head < len(body)), parse_options(parameters, max_points), outputs, identity, timeout
+    )
 
 
 def _given(values: Mapping[str, Span]) -> dict[str, Span]:
@@ -120,7 +130,7 @@ def _unknown_field(name: str) -> Invalid:
 
 
 def _no_part_of_input(name: str) -> Invalid:
-    return Invalid("inputs", f"have a field {shortened(name)}; give one of {INPUT.name} {INPUT.datatype} {INPUT.shape}")
+    return Invalid("inputs", f"have a field {shortened(name)}; give {_EXPECTED}")
 
 
 def _parameters(text: Span | None, max_indices: int) -> dict[str, bytes]:
@@ -186,57 +196,99 @@ def _outputs(text: Span | None, all_binary: bool) -> dict[str, bool]:
     return {name: all_binary if binary is None else binary for name, binary in chosen.items()}
 
 
-def _points(inputs: Span | None, tail: memoryview, max_points: int) -> Points:
-    """The input tensor (N, 3), from the JSON or from the bytes behind it."""
+def _arrays(inputs: Span | None, tail: memoryview, max_points: int) -> dict[str, NDArray[Any]]:
+    """The input tensors by name, from the JSON or from the bytes behind it, where they follow each other."""
     if inputs is None:
-        raise Invalid("inputs", f"are missing; give one, {INPUT.name} {INPUT.datatype} {INPUT.shape}")
-    fields = members(only_element(inputs, "inputs"), "inputs", (*_Input.__struct_fields__, "data"), _no_part_of_input)
-    data = fields.pop("data", None)
-    rest = msgspec.json.encode({name: msgspec.Raw(text.view) for name, text in fields.items()})
-    given: _Input = _bounded(Span.of(rest), "inputs", _Input)
-    if (given.name, given.datatype) != (INPUT.name, INPUT.datatype):
+        raise Invalid("inputs", f"are missing; give {_EXPECTED}")
+    arrays: dict[str, NDArray[Any]] = {}
+    at = 0
+    for text in objects(inputs, "inputs", len(INPUTS)):
+        fields = members(text, "inputs", (*_Input.__struct_fields__, "data"), _no_part_of_input)
+        data = fields.pop("data", None)
+        rest = msgspec.json.encode({name: msgspec.Raw(span.view) for name, span in fields.items()})
+        given: _Input = _bounded(Span.of(rest), "inputs", _Input)
+        _check(given, arrays, max_points)
+        size = given.parameters.binary_data_size if given.parameters else None
+        if (size is None) == (data is None):
+            raise Invalid("inputs", "need either data or the parameter binary_data_size")
+        if data is None:
+            arrays[given.name] = _of_bytes(given, tail[at : at + (size or 0)], size or 0)
+            at += size or 0
+        else:
+            arrays[given.name] = _of_json(given, data, max_points)
+    if at < len(tail):
+        raise Undecodable(f"{len(tail) - at} bytes follow the JSON and the binary tensors that it announces.")
+    if INPUT.name not in arrays:
+        raise Invalid("inputs", f"hold no {INPUT.name}; give {_EXPECTED}")
+    return arrays
+
+
+def _check(given: _Input, arrays: Mapping[str, NDArray[Any]], max_points: int) -> None:
+    """Raise where a tensor is none of those that are known, or of a shape that none of them has."""
+    known = next((tensor for tensor in INPUTS if tensor.name == given.name), None)
+    types = _WHOLE if known and known.datatype == "INT32" else {"FP32": "<f4"}
+    if known is None or given.datatype not in types:
         what = shortened(f"{given.name} of {given.datatype}")
-        raise Invalid("inputs", f"hold {what}; give {INPUT.name} of {INPUT.datatype}")
-    count, width = given.shape
-    if count < 0 or width != 3:
-        raise Invalid("inputs", f"have shape {shortened(str([count, width]))}; give [N, 3]")
-    check_count(count, max_points)
-    size = given.parameters.binary_data_size if given.parameters else None
-    if size is not None and data is None:
-        return _binary_points(tail, count, size)
-    if size is not None or data is None:
-        raise Invalid("inputs", "need either data or the parameter binary_data_size")
-    if len(tail):
-        raise Undecodable(f"{len(tail)} bytes follow the JSON, which announces no binary tensor.")
-    points = _json_points(data, max_points)
-    if len(points) != count:
-        raise Invalid("inputs", f"have {len(points)} points of data; the shape says {count}")
-    return points
+        raise Invalid("inputs", f"hold {what}; give {_EXPECTED}")
+    if given.name in arrays:
+        raise Invalid("inputs", f"hold {given.name} twice; give it once")
+    count, *width = given.shape or [-1]
+    if count < 0 or width != known.shape[1:]:
+        what = shortened(f"{list(given.shape)} of {given.name}")
+        wanted = str(known.shape).replace("-1", "N")
+        raise Invalid("inputs", f"have shape {what}, of another length; give {wanted}")
+    check_count(count, most_rows(max_points))
 
 
-def _binary_points(tail: memoryview, count: int, size: int) -> Points:
-    if not size == len(tail) == 12 * count:
+def _of_bytes(given: _Input, tail: memoryview, size: int) -> NDArray[Any]:
+    dtype = np.dtype(_WHOLE.get(given.datatype, "<f4"))
+    wanted = dtype.itemsize * math.prod(given.shape)
+    if not size == len(tail) == wanted:
         raise Undecodable(
-            f"binary_data_size is {shortened(str(size))}, {len(tail)} bytes follow the JSON, and shape [{count}, 3] of "
-            f"FP32 needs {12 * count}; the three must agree."
+            f"binary_data_size of {given.name} is {shortened(str(size))}, {len(tail)} bytes follow for it, and shape "
+            f"{list(given.shape)} of {given.datatype} needs {wanted}; the three must agree."
         )
-    return np.frombuffer(tail, "<f4").reshape(-1, 3)
+    return np.frombuffer(tail, dtype).reshape(given.shape)
 
 
-def _json_points(data: Span, max_points: int) -> Points:
-    """(N, 3) of an array of triples, or of their numbers in a row."""
-    if _NESTED.match(data.text, data.start, data.end):
-        return points_of_json(data, max_points)
-    check_count(math.ceil(data.count(b",") / 3), max_points)
+def _of_json(given: _Input, data: Span, max_points: int) -> NDArray[Any]:
+    """An array of triples, or its numbers in a row."""
+    rows = most_rows(max_points)
+    if _NESTED.match(data.text, data.start, data.end) and len(given.shape) > 1:
+        array: NDArray[Any] = points_of_json(data, rows, given.name)
+    else:
+        array = _flat(given, data, rows)
+    if len(array) != given.shape[0]:
+        check_count(given.shape[0], max_points)
+        raise Invalid("inputs", f"have {len(array)} points of data; the shape says {given.shape[0]}")
+    return array
+
+
+def _flat(given: _Input, data: Span, rows: int) -> NDArray[Any]:
+    width = math.prod(given.shape[1:])
+    check_count(math.ceil(data.count(b",") / width), rows)
+    is_whole = given.datatype in _WHOLE
+    decoder = _WHOLE_NUMBERS if is_whole else _NUMBERS
     parts = []
     try:
         for chunk in number_chunks(data):
-            parts.append(np.array(_NUMBERS.decode(chunk), np.float64))
-    except (msgspec.DecodeError, UnicodeDecodeError, RecursionError) as error:
+            parts.append(np.array(decoder.decode(chunk), np.int64 if is_whole else np.float64))
+    except (msgspec.DecodeError, OverflowError, UnicodeDecodeError, RecursionError) as error:
         raise broken_chunk("inputs", data, chunk, error) or Invalid(
             "inputs", f"have data that are no numbers: {shortened(str(error))}"
         ) from None
     numbers = np.concatenate(parts)
-    if len(numbers) % 3:
+    if len(numbers) % width:
         raise Invalid("inputs", f"have {len(numbers)} numbers of data, not a multiple of 3; give x, y, z of each point")
-    return as_float32(numbers.reshape(-1, 3))
+    return numbers if is_whole else kept(numbers.reshape(-1, width))
+
+
+def _payload(arrays: Mapping[str, NDArray[Any]], is_binary: bool) -> Payload:
+    """Points that are not finite are left out where they came as bytes; JSON cannot say them."""
+    beside: BesidePoints = {}
+    if "view_index" in arrays:
+        beside["view_index"] = arrays["view_index"]
+    if "normals" in arrays:
+        beside["normals"] = known_normals(arrays["normals"])
+    points = arrays[INPUT.name]
+    return cloud_payload(points, beside=beside) if is_binary else Payload(points, **beside)

@@ -34,7 +34,11 @@ INFER_REQUEST: dict[str, Any] = {
                             "description": "Options, as in `POST /grasps`; a string holds JSON or a plain word. "
                             f"`{BINARY_OUTPUT}`: send every output as bytes.",
                         },
-                        "inputs": {**_TENSORS, "description": "One: points FP32 [-1, 3]."},
+                        "inputs": {
+                            **_TENSORS,
+                            "description": "`points` FP32 [-1, 3]; beside it, if wanted, `view_index` INT32 [-1] and "
+                            "`normals` FP32 [-1, 3].",
+                        },
                         "outputs": {**_TENSORS, "description": "The wanted ones; all where none is named."},
                     },
                 },

@@ -126,7 +126,7 @@ def _reader(request: Request, settings: Settings, model: ModelInfo) -> Reader:
     def read(body: bytearray) -> Asked:
         asked = decode(body, None if head_length is None else int(head_length), settings.max_points)
         options = asked.options.model_copy(update={"model": chosen_model(asked.options, [model]).name})
-        query = build_query(asked.payload, options)
+        query = build_query(asked.payload, options, settings.max_points)
         check_hand(query, model)
 
         def write(result: GraspResult, timings_ms: Mapping[str, float]) -> Response:

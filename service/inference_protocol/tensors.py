@@ -6,6 +6,12 @@ from service import schemas
 
 HEADER_LENGTH = "Inference-Header-Content-Length"
 INPUT = schemas.TensorMetadata(name="points", datatype="FP32", shape=[-1, 3])
+INPUTS = [
+    INPUT,
+    schemas.TensorMetadata(name="view_index", datatype="INT32", shape=[-1]),
+    schemas.TensorMetadata(name="normals", datatype="FP32", shape=[-1, 3]),
+]
+"""What may be sent. The model describes itself by the first alone: clients take for needed what it names."""
 OUTPUTS = [
     schemas.TensorMetadata(name=name, datatype=datatype, shape=shape)
     for name, datatype, shape in (

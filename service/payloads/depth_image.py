@@ -1,38 +1,44 @@
-"""A depth image (16-bit PNG) and its camera -> points; an 8-bit PNG of the same size says what to grasp."""
+"""A depth image and its camera -> points; a label image of the same size says what to grasp."""
 
 from __future__ import annotations
 
-import io
-import struct
-from dataclasses import dataclass
 from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image, UnidentifiedImageError
 
-from service.errors import Invalid, TooLarge, Undecodable, shortened
+from service.errors import Invalid
+from service.payloads.image_file import read_image, size_of
 from service.payloads.options import checked
-from service.payloads.payload import Payload, RawOptions, as_float32, check_count, refuse_empty
+from service.payloads.payload import Payload, Points, RawOptions, most_rows
 from service.schemas import DepthCamera
+from tesnet import plausibility
 from tesnet.geometry import CameraIntrinsics, Pose
+from tesnet.query import FAR, MAX_DIAGONAL, span
 
-PIXELS_PER_POINT = 4
-"""An image may have so many times the pixels of the largest cloud: many of them have no depth."""
+_BLOCK = 1 << 18
+"""Pixels that become points in one go, so that images of any size take little more memory than their points."""
 
-_GRAYSCALE = 0
-_HEAD = struct.Struct(">8sI4sIIBBBBB")
-_SIGNATURE = b"\x89PNG\r\n\x1a\n"
+_FEW = 1000
+"""Points; what fewer of them span says nothing about a scale."""
 
 
 def decode_depth(
-    depth: memoryview, mask: memoryview | None, camera: RawOptions, options: RawOptions, max_points: int
+    depth: memoryview, mask: memoryview | None, camera: RawOptions, options: RawOptions, max_points: int, **others: Any
 ) -> Payload:
     """The points of the pixels that have a depth, in the cloud frame, row by row.
 
+    Args:
+        depth: PNG of 16 bits or .npy; whole numbers are counts, others are metres.
+        mask: PNG of up to 16 bits or .npy of whole numbers.
+        camera: the options of `DepthCamera`.
+        options: the others.
+        max_points: the limit.
+        others: of the payload's fields.
+
     Raises:
-        Undecodable: no PNG, or a damaged one.
-        TooLarge, TooManyPoints: more pixels or points than the limits.
+        Undecodable, UnreadableFile: no image, or a damaged one.
+        TooLarge: more pixels than the limits.
         Invalid: pixels of another kind, a mask of another size, a camera that is none.
     """
     if "intrinsics" not in camera:
@@ -41,24 +47,67 @@ def decode_depth(
         )
     given = checked(DepthCamera, camera)
     T_cloud_camera = _pose(given)
-    max_pixels = PIXELS_PER_POINT * max_points
-    counts = _pixels(depth, "depth", (16,), max_pixels)
-    targets = None if mask is None else _pixels(mask, "mask", (1, 2, 4, 8), max_pixels) != 0
-    if targets is not None and targets.shape != counts.shape:
-        raise Invalid("mask", f"is of {_size(targets)} pixels, the depth image of {_size(counts)}; send equal sizes")
-    is_point = counts.ravel() != 0
-    check_count(int(is_point.sum()), max_points)
-    height, width = counts.shape
+    max_pixels = most_rows(max_points)
+    image = read_image(depth, "depth", (16,), "iuf", max_pixels)
+    labels = None if mask is None else read_image(mask, "mask", (1, 2, 4, 8, 16), "biu", max_pixels)
+    if labels is not None and labels.shape != image.shape:
+        raise Invalid("mask", f"is of {size_of(labels)} pixels, the depth image of {size_of(image)}; send equal sizes")
+    height, width = image.shape
     k = given.intrinsics
     intrinsics = CameraIntrinsics(width, height, fx=k.fx, fy=k.fy, cx=k.cx, cy=k.cy)
-    points_camera = intrinsics.back_project(counts * given.depth_scale)
+    problem = plausibility.normalised_intrinsics(intrinsics)
+    if problem is not None:
+        raise Invalid("intrinsics", problem)
+    is_point = _with_depth(image, given.stride)
+    depths = image[is_point]
+    scale = None if image.dtype.kind == "f" else given.depth_scale
+    points = _points(image, is_point, intrinsics, 1.0 if scale is None else scale, T_cloud_camera)
+    _check_metres(points, depths, scale)
     return Payload(
-        points=as_float32(T_cloud_camera.apply(points_camera)),
+        points=points,
         options=options,
-        is_point=is_point,
-        mask=None if targets is None else targets.ravel(),
+        is_point=is_point.ravel(),
+        mask=None if labels is None else labels.ravel(),
         viewpoint=T_cloud_camera.translation,
+        notes=tuple(plausibility.depth_notes(intrinsics, depths, scale, given.stride)),
+        **others,
     )
+
+
+def _with_depth(image: NDArray[Any], stride: int) -> NDArray[np.bool_]:
+    """Mask (height, width) of the pixels that become points: on the grid of the stride, with a depth."""
+    mask = np.zeros(image.shape, dtype=bool)
+    grid = image[::stride, ::stride]
+    mask[::stride, ::stride] = (grid > 0) & np.isfinite(grid) if image.dtype.kind == "f" else grid > 0
+    return mask
+
+
+def _points(
+    image: NDArray[Any], is_point: NDArray[np.bool_], intrinsics: CameraIntrinsics, scale: float, T_cloud_camera: Pose
+) -> Points:
+    """(N, 3) in the cloud frame, block by block of the image's rows."""
+    far = np.abs(T_cloud_camera.translation).max() >= FAR
+    points: Points = np.empty((np.count_nonzero(is_point), 3), np.float64 if far else np.float32)
+    height, width = image.shape
+    rows = max(1, _BLOCK // width)
+    done = 0
+    for top in range(0, height, rows):
+        block = np.where(is_point[top : top + rows], image[top : top + rows], 0).astype(np.float64) * scale
+        part = CameraIntrinsics(
+            width, len(block), fx=intrinsics.fx, fy=intrinsics.fy, cx=intrinsics.cx, cy=intrinsics.cy - top
+        )
+        found = T_cloud_camera.apply(part.back_project(block))
+        with np.errstate(over="ignore"):  # what float32 cannot hold becomes infinite, and is refused as that
+            points[done : done + len(found)] = found
+        done += len(found)
+    return points
+
+
+def _check_metres(points: Points, depths: NDArray[Any], scale: float | None) -> None:
+    """Refuse what spans too much, in words that fit an image: its points are nothing that the client has seen."""
+    if len(points) >= _FEW and np.isfinite(points).all() and (diagonal := span(points)) > MAX_DIAGONAL:
+        field, message = plausibility.depths_beyond(diagonal, float(np.median(depths)), scale)
+        raise Invalid(field, message)
 
 
 def _pose(camera: DepthCamera) -> Pose:
@@ -67,58 +116,6 @@ def _pose(camera: DepthCamera) -> Pose:
     if list(camera.T_cloud_camera[3]) != [0, 0, 0, 1]:
         raise Invalid("T_cloud_camera", f"has the last row {list(camera.T_cloud_camera[3])}; it must be [0, 0, 0, 1]")
     try:
-        return Pose.from_matrix(camera.T_cloud_camera)
+        return Pose.nearest(camera.T_cloud_camera)
     except ValueError as error:
         raise Invalid("T_cloud_camera", str(error)) from None
-
-
-# ----------------------------------------------------------------------------------------------------------------- PNG
-
-
-@dataclass(frozen=True, slots=True)
-class _Head:
-    width: int
-    height: int
-    bits: int
-    colours: int
-
-
-def _pixels(file: memoryview, name: str, bits: tuple[int, ...], max_pixels: int) -> NDArray[Any]:
-    """The grey values (height, width) of a PNG; its size is known and checked before it is expanded."""
-    refuse_empty(file, f"file `{name}`")
-    head = _head(file, name)
-    if head.width * head.height > max_pixels:
-        raise TooLarge(
-            f"The file `{name}` has {head.width} x {head.height} pixels (limit {max_pixels} in all); crop or shrink it."
-        )
-    if head.colours != _GRAYSCALE or head.bits not in bits:
-        kind = "grey" if head.colours == _GRAYSCALE else "coloured"
-        raise Invalid(name, f"has {kind} pixels of {head.bits} bits; save a grey PNG of {bits[-1]} bits a pixel")
-    try:
-        with Image.open(io.BytesIO(file), formats=("PNG",)) as image:
-            if image.size == (head.width, head.height):  # a second header would be expanded as it says
-                return np.array(image)
-    except UnidentifiedImageError:  # its words would name our buffer
-        raise Undecodable(
-            f"The file `{name}` is a damaged PNG (no pixels behind its head; it was cut off); save it again."
-        ) from None
-    except Exception as error:  # noqa: BLE001 - a damaged image fails in many ways
-        raise Undecodable(f"The file `{name}` is a damaged PNG ({shortened(str(error))}); save it again.") from None
-    raise Undecodable(f"The file `{name}` is a PNG with two headers that differ; save it again.")
-
-
-def _head(file: memoryview, name: str) -> _Head:
-    """What the PNG's first chunk says (PNG specification, 11.2.2)."""
-    if len(file) >= _HEAD.size:
-        signature, _, chunk, width, height, bits, colours, *methods, interlaced = _HEAD.unpack_from(file)
-        if signature == _SIGNATURE and chunk == b"IHDR" and width > 0 and height > 0:
-            if methods != [0, 0] or interlaced > 1:  # compression and filter: there are no others
-                what = f"{methods[0]}, {methods[1]} and {interlaced}"
-                raise Undecodable(f"The PNG `{name}` says it is compressed, filtered and interlaced by methods {what}.")
-            return _Head(width, height, bits, colours)
-    raise Undecodable(f"The file `{name}` does not begin like a PNG; send one.")
-
-
-def _size(image: NDArray[Any]) -> str:
-    height, width = image.shape
-    return f"{width} x {height}"

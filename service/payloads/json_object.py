@@ -108,21 +108,25 @@ def members(span: Span, what: str, known: Collection[str], unknown: Callable[[st
     return found
 
 
-def only_element(span: Span, what: str) -> Span:
-    """The text of the object that is an array's only element.
+def objects(span: Span, what: str, most: int) -> list[Span]:
+    """The texts of the objects that an array holds: 1 to `most` of them.
 
     Raises:
         Undecodable: no JSON.
-        Invalid: not an array of one object.
+        Invalid: an array of something else, or of another number.
     """
     text, end = span.text, span.end
+    found: list[Span] = []
     at = _after_space(text, span.start + 1, end)
-    if _byte(text, span.start, end) == b"[" and _byte(text, at, end) == b"{":
-        element = Span(text, at, _value_end(text, at, end, what))
-        if text[_after_space(text, element.end, end) : end] == b"]":
-            return element
+    while _byte(text, span.start, end) == b"[" and _byte(text, at, end) == b"{" and len(found) < most:
+        found.append(Span(text, at, _value_end(text, at, end, what)))
+        at = _after_space(text, found[-1].end, end)
+        if text[at:end] == b"]":
+            return found
+        if _byte(text, at, end) == b",":
+            at = _after_space(text, at + 1, end)
     check_json(what, bytes(span))
-    raise Invalid(what, "cannot be used: they must be an array of one object")
+    raise Invalid(what, f"cannot be used: they must be an array of 1 to {most} objects")
 
 
 def number_chunks(array: Span) -> Iterator[bytes | memoryview]:

@@ -10,13 +10,13 @@ from python_multipart.multipart import MultipartParser, parse_options_header
 from service.errors import Invalid, Undecodable, shortened
 from service.payloads.depth_image import decode_depth
 from service.payloads.json_object import Span, members
-from service.payloads.npy_body import MAGIC, decode_npy
-from service.payloads.options import check_length, json_text, merged, option_texts, unknown_option
-from service.payloads.payload import Payload, as_float32, refuse_empty
+from service.payloads.options import BESIDE_POINTS, check_length, json_text, merged, option_texts, unknown_option
+from service.payloads.payload import BesidePoints, Payload, RawOptions, cloud_payload, file_of, refuse_empty
+from service.payloads.per_point import per_point
 from service.schemas import DepthCamera, DepthOptions
 from tesnet import formats
 
-FILES = ("cloud", "depth", "mask")
+FILES = ("cloud", "depth", "mask", *BESIDE_POINTS)
 PARTS = frozenset((*FILES, "options", *DepthOptions.model_fields))
 """Each option may also be a part of its own."""
 
@@ -26,7 +26,7 @@ _MAX_HEADER_BYTES = 4096
 
 
 def decode_multipart(boundary: bytes, body: bytearray, max_points: int) -> Payload:
-    """The cloud of a form. Each option stands in the part `options`, a JSON object, or is a part of its own."""
+    """The cloud of a form, or its depth image. Options stand in the part `options`, a JSON object, or in their own."""
     refuse_empty(body)
     spans = _split(boundary, body)
     options = _part_options(spans, max_points)
@@ -35,28 +35,29 @@ def decode_multipart(boundary: bytes, body: bytearray, max_points: int) -> Paylo
     given = [name for name in ("cloud", "depth") if name in parts]
     if len(given) != 1:
         what = "is missing" if not given else "is given beside `depth`"
-        raise Invalid("cloud", f"{what}; send one file, `cloud` (.npy, .ply, .pcd) or `depth` (16-bit PNG)")
+        raise Invalid(
+            "cloud", f"{what}; send one file, `cloud` ({formats.LISTED}) or `depth` (16-bit grey PNG or .npy)"
+        )
+    beside = per_point(spans, max_points)
     if "depth" in parts:
-        return decode_depth(parts["depth"], parts.get("mask"), camera, options, max_points)
+        return decode_depth(parts["depth"], parts.get("mask"), camera, options, max_points, **beside)
     if "mask" in parts:
         raise Invalid("mask", "belongs to a depth image; with a cloud give `target`")
     if camera:
         raise Invalid(next(iter(camera)), "belongs to a depth image; send a file `depth`, or leave it out")
-    return _decode_cloud(parts["cloud"], options, max_points)
+    return _decode_cloud(parts["cloud"], options, beside, max_points)
 
 
-def _decode_cloud(file: memoryview, options: Mapping[str, bytes], max_points: int) -> Payload:
+def _decode_cloud(file: memoryview, options: RawOptions, beside: BesidePoints, max_points: int) -> Payload:
     """The points of a file, whose first bytes tell its format; what it is called does not matter."""
     refuse_empty(file, "file `cloud`")
-    if bytes(file[: len(MAGIC)]) == MAGIC:
-        return Payload(decode_npy(file, max_points).points, options)
-    if formats.is_ply(file):
-        return Payload(as_float32(formats.read_ply(file, max_points)), options)
-    if formats.is_pcd(file):
-        rows = formats.read_pcd(file, max_points)
-        is_point = formats.seen(rows)
-        return Payload(as_float32(rows[is_point]), options, is_point)
-    raise Undecodable("The file `cloud` begins like none of .npy, .ply and .pcd; send one of them.")
+    found = formats.format_of(file)
+    if found is None:
+        raise Undecodable(f"The file `cloud` begins like none of {formats.LISTED}; send one of them.")
+    cloud = file_of(file, found.read, max_points)
+    if cloud.normals is not None and "normals" not in beside:
+        beside = {**beside, "normals": cloud.normals}
+    return cloud_payload(cloud.points, options, beside, cloud.viewpoint)
 
 
 def _part_options(parts: Mapping[str, Span], max_points: int) -> dict[str, bytes]:

@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 
 from service.errors import Undecodable
-from service.payloads.payload import Payload, check_count, refuse_empty
+from service.payloads.payload import Payload, check_count, cloud_payload, most_rows, refuse_empty
 
 
 def decode_octet_stream(body: bytearray, max_points: int) -> Payload:
@@ -15,5 +15,5 @@ def decode_octet_stream(body: bytearray, max_points: int) -> Payload:
         raise Undecodable(
             f"The body has {len(body)} bytes, not a multiple of 12; send x, y, z of a point as little-endian float32."
         )
-    check_count(len(body) // 12, max_points)
-    return Payload(np.frombuffer(body, "<f4").reshape(-1, 3))
+    check_count(len(body) // 12, most_rows(max_points))
+    return cloud_payload(np.frombuffer(body, "<f4").reshape(-1, 3))

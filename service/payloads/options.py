@@ -21,6 +21,9 @@ if TYPE_CHECKING:
 
 Model = TypeVar("Model", bound=BaseModel)
 
+BESIDE_POINTS = ("view_index", "normals")
+"""What comes with the points, one entry for each, and is no option."""
+
 MAX_OPTIONS_BYTES = 65_536
 """JSON text of all options together, but for a target's indices."""
 
@@ -142,6 +145,8 @@ def unknown_option(name: str) -> Invalid:
         return Invalid(
             name, "belongs to a depth image: send a form with a file `depth`, and this in its part `options`"
         )
+    if name in BESIDE_POINTS:
+        return Invalid(name, "belongs beside the points: in a JSON body with `points`, or in a form as a .npy file")
     known = list(GraspOptions.model_fields)
     close = difflib.get_close_matches(name[:64], known, 1)
     hint = f"did you mean {close[0]}? " if close else ""
@@ -187,7 +192,7 @@ def _many_indices(text: bytes, max_indices: int) -> Target | None:
     """
     values = members(Span.of(text), "target", Target.model_fields, _no_part_of_target)
     written = values.get("indices")
-    if "box" in values or written is None or text[written.start : written.start + 1] != b"[":
+    if len(values) > 1 or written is None or text[written.start : written.start + 1] != b"[":
         check_json("target", text)
         return checked(GraspOptions, {"target": text}).target
     indices = array.array("q")
@@ -202,7 +207,7 @@ def _many_indices(text: bytes, max_indices: int) -> Target | None:
         raise broken_chunk("target", written, chunk, error) or Invalid(
             "target", f"has something else than whole numbers after {len(indices)} indices; give numbers of points"
         ) from None
-    return Target.model_construct(box=None, indices=indices)
+    return Target.model_construct(box=None, label=None, indices=indices)
 
 
 def _is_long_target(name: str, text: bytes) -> bool:

@@ -7,10 +7,12 @@ from __future__ import annotations
 
 from collections.abc import Awaitable, Callable, Mapping
 from pathlib import Path
+from string import Template
 
 from fastapi import APIRouter, Request, Response
 
 from service.grasps import GraspEndpoint
+from tesnet import formats
 
 ADDRESS = "/viewer"
 
@@ -37,7 +39,7 @@ def viewer(endpoint: GraspEndpoint) -> APIRouter:
     router = APIRouter(tags=["viewer"])
     folder = Path(__file__).parent
     for address, (name, media_type) in _FILES.items():
-        content = (folder / name).read_bytes()
+        content = _with_formats((folder / name).read_bytes()) if address == ADDRESS else (folder / name).read_bytes()
         router.add_api_route(
             address,
             _sender(content, media_type),
@@ -52,6 +54,12 @@ def viewer(endpoint: GraspEndpoint) -> APIRouter:
         return await endpoint.answer_points(request)
 
     return router
+
+
+def _with_formats(page: bytes) -> bytes:
+    """The page, told which files the service reads."""
+    text = Template(page.decode()).substitute(listed=formats.LISTED, suffixes=",".join(formats.SUFFIXES))
+    return text.encode()
 
 
 def _sender(content: bytes, media_type: str) -> Callable[[], Awaitable[Response]]:

@@ -2,12 +2,12 @@
 import { Scene } from "/viewer/scene.js";
 
 const EXAMPLE_OPTIONS = { viewpoint: [0.38, 0.55, 0.48], up: [0, 0, 1], support_height: 0.05, max_grasps: 10 };
-const OWN_OPTIONS = { viewpoint: [0, 0, 0], max_grasps: 10 };
+const OWN_OPTIONS = { max_grasps: 10 };
 const PREGRASP_DISTANCE = 0.05; // metres; the page asks for it unless the options do
 
 const element = (id) => document.getElementById(id);
 const scene = new Scene(element("canvas"));
-let points = null; // Float32Array of x, y, z triples
+let cloud = null; // the file that is shown
 
 async function post(address, body, type, accept) {
   const headers = { Accept: accept };
@@ -46,15 +46,20 @@ function write(options) {
   element("options").value = `{\n${lines.join(",\n")}\n}`;
 }
 
-// Any file that the service reads; it decodes the file, so that what is shown is what it works with.
-async function open(file, options) {
+function formOf(file) {
   const form = new FormData();
   form.append("cloud", file, file.name);
+  return form;
+}
+
+// Any file that the service reads; it decodes the file, so that what is shown is what it works with.
+async function open(file, options) {
   write(options);
   forget();
   say(`Reading ${file.name} ...`);
-  const answer = await post("/viewer/points", form, null, "*/*");
-  points = new Float32Array(await answer.arrayBuffer());
+  const answer = await post("/viewer/points", formOf(file), null, "*/*");
+  const points = new Float32Array(await answer.arrayBuffer());
+  cloud = file;
   element("hint").hidden = true;
   element("ask").disabled = false;
   scene.show(points, options);
@@ -66,7 +71,7 @@ async function ask() {
   options.pregrasp_distance ??= PREGRASP_DISTANCE;
   const query = Object.entries(options).map(([name, value]) => `${name}=${encodeURIComponent(JSON.stringify(value))}`);
   say("Asking ...");
-  const answer = await post(`/grasps?${query.join("&")}`, points, "application/octet-stream", "application/json");
+  const answer = await post(`/grasps?${query.join("&")}`, formOf(cloud), null, "application/json");
   const reply = await answer.json();
   const { points: posted, candidates, collision_free: free } = reply.counts;
   const found = reply.grasps.length ? `${reply.grasps.length} grasps` : `No grasp: ${reply.reason.replaceAll("_", " ")}`;
@@ -76,7 +81,7 @@ async function ask() {
 }
 
 function forget() {
-  points = null;
+  cloud = null;
   element("ask").disabled = true;
   scene.showGrasps([], []);
   list({ grasps: [], warnings: [] }, "panda");

@@ -1,7 +1,8 @@
-"""What the headers of PLY and PCD files have in common: lines of words before the data."""
+"""What text at the beginning of cloud files has in common: byte order marks, lines of words before the data, counts."""
 
 from __future__ import annotations
 
+import codecs
 from typing import TypeAlias
 
 from tesnet.errors import TooManyPoints, UnreadableFile
@@ -10,22 +11,39 @@ Content: TypeAlias = bytes | bytearray | memoryview
 
 MAX_HEADER_BYTES = 65_536
 _MAX_DIGITS = 12
+_WIDE_MARKS = (codecs.BOM_UTF16_LE, codecs.BOM_UTF16_BE)
+
+
+def unmarked(content: Content) -> Content:
+    """The content behind a byte order mark, if it begins with one; UTF-16 (as Windows' consoles write it) as UTF-8."""
+    if bytes(content[:3]) == codecs.BOM_UTF8:
+        return memoryview(content)[3:]
+    if bytes(content[:2]) in _WIDE_MARKS:
+        return bytes(content).decode("utf-16", "replace").encode()
+    return content
+
+
+def beginning(content: Content, size: int = MAX_HEADER_BYTES) -> bytes:
+    """The first bytes behind a byte order mark, for a look at what they are."""
+    return bytes(unmarked(memoryview(content)[:size]))
 
 
 def header_lines(content: Content, last: str, kind: str) -> tuple[list[list[str]], int]:
     """The header's lines, each as its words, up to the line that begins with the word `last`; where the data starts.
 
+    Lines end as the first one does: with a line feed, a carriage return, or both. Bytes outside of ASCII, which occur
+    in comments, mean nothing and may be of any encoding.
+
     Raises:
-        UnreadableFile: no such line in the first 64 KiB, or bytes that are no ASCII.
+        UnreadableFile: no such line in the first 64 KiB.
     """
     head = bytes(memoryview(content)[:MAX_HEADER_BYTES])
+    feed, ending = head.find(b"\n"), head.find(b"\r")
+    separator = b"\r" if ending >= 0 and not 0 <= feed <= ending + 1 else b"\n"
     lines: list[list[str]] = []
     start = 0
-    while (end := head.find(b"\n", start)) >= 0:
-        try:
-            words = head[start:end].decode("ascii").split()
-        except UnicodeDecodeError:
-            break
+    while (end := head.find(separator, start)) >= 0:
+        words = [word.decode("latin-1") for word in head[start:end].split()]
         start = end + 1
         if words:
             lines.append(words)

@@ -3,7 +3,7 @@
 from __future__ import annotations
 
 import importlib
-from collections.abc import Mapping
+from collections.abc import Mapping, Sequence
 from dataclasses import dataclass
 from typing import Any
 
@@ -11,11 +11,20 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tesnet.errors import UnreadableFile
-from tesnet.formats.header import Content, check_bytes, check_count, header_lines, whole_number
+from tesnet.formats.cloud_file import CloudFile, given_normals, given_viewpoint
+from tesnet.formats.header import (
+    Content,
+    beginning,
+    check_bytes,
+    check_count,
+    header_lines,
+    unmarked,
+    whole_number,
+)
 from tesnet.formats.text import read_rows
 
 MAX_EXPANDED_BYTES = 64
-"""Bytes a point to which a compressed file may expand; x, y, z and a colour take 16."""
+"""Bytes a row to which a compressed file may expand; x, y, z and a colour take 16."""
 
 _MAX_EXPANSION = 100
 """LZF makes at most 264 bytes of 3."""
@@ -23,18 +32,20 @@ _MAX_EXPANSION = 100
 _MAX_ROW_BYTES = 1 << 20
 """Far beyond any sensor's row, and what numpy's rows may have."""
 
+_POINT, _NORMAL = ("x", "y", "z"), ("normal_x", "normal_y", "normal_z")
 _SIZES = {"F": (4, 8), "I": (1, 2, 4, 8), "U": (1, 2, 4, 8)}
 
 
 @dataclass(frozen=True, slots=True)
 class _Header:
-    """Where everything is: the number of points, each field's name, type, elements and offset in a row, in bytes."""
+    """Where everything is: the number of points, each field's name, type and elements; where the camera stood."""
 
     points: int
     names: tuple[str, ...]
     formats: tuple[str, ...]
     counts: tuple[int, ...]
     data: str
+    viewpoint: NDArray[np.float64] | None
 
     @property
     def sizes(self) -> list[int]:
@@ -46,38 +57,40 @@ class _Header:
 
 
 def is_pcd(content: Content) -> bool:
-    """Whether this begins like a PCD file."""
-    return bytes(content[:64]).lstrip().startswith((b"# .PCD", b"VERSION", b"FIELDS"))
+    """Whether this begins like a PCD file, comments or not."""
+    for line in beginning(content).splitlines():
+        if line.startswith(b"# .PCD") or line.split()[:1] in ([b"VERSION"], [b"FIELDS"]):
+            return True
+        if line.strip() and not line.startswith(b"#"):
+            break
+    return False
 
 
-def seen(points: NDArray[Any]) -> NDArray[np.bool_]:
-    """Mask (R,) of the rows (R, 3) of a PCD file that are points.
-
-    An organised cloud has a row for every pixel, and NaN in all three coordinates where there was no depth.
-    """
-    return np.asarray(~np.isnan(points).all(axis=1))
-
-
-def read_pcd(content: Content, max_points: int | None = None) -> NDArray[Any]:
-    """Rows (R, 3) in numbers of the file's own type; text gives float64. See `seen` for rows without a point.
+def read_pcd(content: Content, max_points: int | None = None) -> CloudFile:
+    """Rows in numbers of the file's own type (text gives float64), normals, and where `VIEWPOINT` puts the camera.
 
     Raises:
         UnreadableFile: another format, cut off, damaged, or without fields x, y and z.
         TooManyPoints: more rows than `max_points`.
         ModuleNotFoundError: the file is compressed and `lzf` is not installed.
     """
+    content = unmarked(content)
     lines, start = header_lines(content, "DATA", "PCD")
     header = _parse(lines)
     check_count(header.points, max_points)
-    columns = [_field(header, axis) for axis in "xyz"]
+    names = [*_POINT, *(_NORMAL if set(_NORMAL) <= set(header.names) else ())]
+    columns = [_field(header, name) for name in names]
     if header.points == 0:
-        return np.empty((0, 3))
+        return CloudFile(np.empty((0, 3)))
     if header.data == "ascii":
         before = [sum(header.counts[:column]) for column in columns]
-        return read_rows(content, start, 0, header.points, before, "PCD")
-    if header.data == "binary":
-        return _binary_points(content, start, header, columns)
-    return _columns_of(_expanded(content, start, header, max_points), header, columns)
+        table = read_rows(content, start, 0, header.points, before, "PCD")
+    elif header.data == "binary":
+        table = _binary_table(content, start, header, columns)
+    else:
+        table = _columns_of(_expanded(content, start, header, max_points), header, columns)
+    normals = given_normals(table[:, 3:]) if len(names) > len(_POINT) else None
+    return CloudFile(table[:, :3], normals, header.viewpoint)
 
 
 def _parse(lines: list[list[str]]) -> _Header:
@@ -106,12 +119,29 @@ def _parse(lines: list[list[str]]) -> _Header:
     if data not in ("ascii", "binary", "binary_compressed"):
         raise UnreadableFile(f"The PCD's DATA is {data[:40]!a}; valid: ascii, binary, binary_compressed.")
     formats = tuple(f"<{kind.lower()}{size}" for kind, size in zip(kinds, sizes, strict=True))
-    header = _Header(points, names, formats, tuple(counts), data)
+    header = _Header(points, names, formats, tuple(counts), data, _viewpoint(given.get("VIEWPOINT", [])))
     if header.row_bytes > _MAX_ROW_BYTES:
         raise UnreadableFile(
             f"The PCD header gives a point {header.row_bytes} bytes (limit {_MAX_ROW_BYTES}); save x, y and z alone."
         )
     return header
+
+
+def _viewpoint(words: Sequence[str]) -> NDArray[np.float64] | None:
+    """The position that a line VIEWPOINT begins with; its quaternion is of no use here.
+
+    Raises:
+        UnreadableFile: something else than numbers.
+    """
+    if not words:
+        return None
+    try:
+        position = np.array([float(word) for word in words[:3]])
+    except ValueError:
+        position = np.empty(0)
+    if len(position) < 3:
+        raise UnreadableFile(f"The PCD's VIEWPOINT is {' '.join(words)[:40]!a}; it must begin with x, y, z.")
+    return given_viewpoint(position)
 
 
 def _words(given: Mapping[str, list[str]], name: str) -> list[str]:
@@ -130,18 +160,22 @@ def _field(header: _Header, axis: str) -> int:
     return column
 
 
-def _binary_points(content: Content, start: int, header: _Header, columns: list[int]) -> NDArray[Any]:
+def _binary_table(content: Content, start: int, header: _Header, columns: list[int]) -> NDArray[Any]:
+    """The wanted fields (R, len(columns)) of binary data, where the fields of a point stand together."""
     check_bytes(header.points * header.row_bytes, len(content) - start, "PCD")
-    dtype = np.dtype(
-        {
-            "names": ["x", "y", "z"],
-            "formats": [header.formats[column] for column in columns],
-            "offsets": [sum(header.sizes[:column]) for column in columns],
-            "itemsize": header.row_bytes,
-        }
+    return np.stack(
+        [
+            np.ndarray(
+                (header.points,),
+                header.formats[column],
+                content,
+                start + sum(header.sizes[:column]),
+                (header.row_bytes,),
+            )
+            for column in columns
+        ],
+        axis=1,
     )
-    table = np.frombuffer(content, dtype, header.points, start)
-    return np.stack([table[axis] for axis in "xyz"], axis=1)
 
 
 def _expanded(content: Content, start: int, header: _Header, max_points: int | None) -> bytes:
@@ -169,7 +203,7 @@ def _expanded(content: Content, start: int, header: _Header, max_points: int | N
 
 
 def _columns_of(data: bytes, header: _Header, columns: list[int]) -> NDArray[Any]:
-    """Points (N, 3) of expanded data, where each field of all points stands together."""
+    """The wanted fields (R, len(columns)) of expanded data, where each field of all points stands together."""
     starts = [header.points * sum(header.sizes[:column]) for column in columns]
     return np.stack(
         [

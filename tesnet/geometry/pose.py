@@ -11,6 +11,9 @@ Array = NDArray[np.float64]
 
 _ORTHONORMAL_TOLERANCE = 1e-5
 
+ROUNDED_TOLERANCE = 0.005
+"""By how much R R^T of a matrix that `Pose.nearest` takes may differ from the identity."""
+
 
 def frozen(values: ArrayLike, shape: tuple[int, ...], name: str) -> Array:
     """A read-only float64 copy of `values`.
@@ -62,8 +65,8 @@ class Pose:
         if deviation > _ORTHONORMAL_TOLERANCE or np.linalg.det(self.rotation) < 0:
             raise ValueError(
                 f"rotation is no rotation matrix: R R^T differs from the identity by {deviation:.2e} "
-                f"(limit {_ORTHONORMAL_TOLERANCE:g}), determinant {np.linalg.det(self.rotation):.3f} (must be +1); "
-                "give its numbers with 6 decimals or more"
+                f"(limit {_ORTHONORMAL_TOLERANCE:g}; {ROUNDED_TOLERANCE:g} for a rounded matrix), determinant "
+                f"{np.linalg.det(self.rotation):.3f} (must be +1); give its numbers with more decimals"
             )
 
     # Factories
@@ -78,6 +81,20 @@ class Pose:
         """From a homogeneous (4, 4) matrix."""
         array = frozen(matrix, (4, 4), "matrix")
         return cls(array[:3, :3], array[:3, 3])
+
+    @classmethod
+    def nearest(cls, matrix: ArrayLike) -> Pose:
+        """From a homogeneous (4, 4) matrix whose numbers were rounded: the rotation nearest to its upper left part.
+
+        Raises:
+            ValueError: also where R R^T differs from the identity by more than 0.005; three decimals leave 0.002.
+        """
+        array = frozen(matrix, (4, 4), "matrix")
+        deviation = float(np.abs(array[:3, :3] @ array[:3, :3].T - np.eye(3)).max())
+        if not _ORTHONORMAL_TOLERANCE < deviation <= ROUNDED_TOLERANCE:
+            return cls(array[:3, :3], array[:3, 3])
+        left, _, right = np.linalg.svd(array[:3, :3])
+        return cls(left @ right, array[:3, 3])
 
     @classmethod
     def from_quaternion(cls, quaternion_xyzw: ArrayLike, translation: ArrayLike) -> Pose:

@@ -206,8 +206,8 @@ def test_an_unreachable_or_foreign_service_exits_3(
     assert capsys.readouterr().out == ""
 
 
-def test_a_cloud_with_nan_is_refused_here(tmp_path: Path, closed_url: str, capsys: pytest.CaptureFixture[str]) -> None:
+def test_a_cloud_of_nan_is_refused_here(tmp_path: Path, closed_url: str, capsys: pytest.CaptureFixture[str]) -> None:
     path = tmp_path / "cloud.xyz"
-    path.write_text("0 0 nan\n1 1 1\n")
+    path.write_text("0 0 nan\n1 nan 1\n")
     assert main([str(path), "--url", closed_url]) == 2
-    assert "points: 1 of 2 are NaN" in capsys.readouterr().err
+    assert "points: have 2 rows, none of them finite" in capsys.readouterr().err

@@ -39,6 +39,31 @@ def test_metres_are_rounded_to_counts_and_what_is_no_depth_becomes_zero() -> Non
     assert mask_levels(np.array([[True, False]]), (1, 2)).tolist() == [[255, 0]]
 
 
+@pytest.mark.parametrize(("labels", "dtype"), [([[0, 7, 255]], np.uint8), ([[0, 7, 65_535]], np.uint16)])
+def test_labels_of_a_mask_stay_what_they_are(labels: list[list[int]], dtype: type) -> None:
+    levels = mask_levels(np.array(labels), (1, 3))
+    assert levels.dtype == dtype
+    assert levels.tolist() == labels
+    request = depth_request(np.ones((1, 3)), CAMERA, {"target": {"label": 7}}, mask=np.array(labels), stride=1)
+    payload = decoder_for(request.headers["Content-Type"])(bytearray(request.content), 1000)
+    assert payload.mask is not None
+    assert payload.mask.tolist() == labels[0]
+
+
+def test_images_of_npy_travel_as_they_are_with_the_stride() -> None:
+    files = []
+    for array in (np.full((4, 6), 0.5, np.float32), np.eye(4, 6, dtype=np.uint8)):
+        file = io.BytesIO()
+        np.save(file, array)
+        files.append(file.getvalue())
+    request = depth_request(files[0], CAMERA, {}, mask=files[1], stride=2)
+    payload = decoder_for(request.headers["Content-Type"])(bytearray(request.content), 1000)
+    assert len(payload.points) == 6
+    np.testing.assert_allclose(payload.points[:, 2], 0.5)
+    assert payload.mask is not None
+    assert payload.mask.reshape(4, 6).tolist() == np.eye(4, 6).tolist()
+
+
 @pytest.mark.parametrize(
     ("depth", "mask", "scale", "argument"),
     [
@@ -51,6 +76,8 @@ def test_metres_are_rounded_to_counts_and_what_is_no_depth_becomes_zero() -> Non
         (np.ones((2, 2)), None, 0.0, "depth_scale"),
         (np.ones((2, 2)), np.ones((2, 3)), 0.001, "mask"),
         (np.ones((2, 2)), np.array([["a", "b"], ["c", "d"]]), 0.001, "mask"),
+        (np.ones((2, 2)), np.full((2, 2), 65_536), 0.001, "mask"),
+        (np.ones((2, 2)), np.full((2, 2), -1), 0.001, "mask"),
     ],
 )
 def test_an_image_that_cannot_be_sent_is_refused_before_it_is(
@@ -97,7 +124,7 @@ def test_the_service_reads_the_points_and_the_mask_that_the_client_means(
     payload = decoder_for(request.headers["Content-Type"])(bytearray(request.content), 1000)
     np.testing.assert_allclose(payload.points, pose.apply(intrinsics.back_project(counts * 0.001)), rtol=1e-5)
     assert payload.mask is not None
-    np.testing.assert_array_equal(payload.mask, mask.ravel())
+    np.testing.assert_array_equal(payload.mask != 0, mask.ravel())
     assert payload.options == {"seed": b"3"}
 
 

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import io
 import json
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
@@ -13,6 +14,7 @@ from hypothesis.extra import numpy as npst
 from client.errors import InvalidArgument
 from client.request import GraspOptions, GripperSize, Intrinsics, checked_points, header_value, points_request
 from service import schemas
+from service.payloads import decoder_for
 
 CLOUD = np.zeros((2, 3), dtype=np.float32)
 EVERY_OPTION: dict[str, Any] = {
@@ -41,7 +43,7 @@ def _query(options: dict[str, Any]) -> dict[str, Any]:
     return {name: json.loads(values[0]) for name, values in query.items()}
 
 
-@given(npst.arrays(np.float32, st.tuples(st.integers(1, 20), st.just(3)), elements=st.floats(-100, 100, width=32)))
+@given(npst.arrays(np.float32, st.tuples(st.integers(1, 20), st.just(3)), elements=st.floats(-60, 60, width=32)))
 def test_the_body_is_the_points_as_little_endian_float32_triples(points: np.ndarray[Any, Any]) -> None:
     for same in (points, points.astype(">f4"), points.astype(np.float64), np.asfortranarray(points), points.tolist()):
         content = points_request(same, {}).content
@@ -58,8 +60,7 @@ def test_the_body_is_the_points_as_little_endian_float32_triples(points: np.ndar
         (np.zeros((4, 3), dtype=bool), "dtype bool"),
         (np.zeros((4, 3), dtype=complex), "dtype complex128"),
         (np.array([["a", "b", "c"]]), "dtype <U1"),
-        (np.array([[0, 0, np.nan], [0, 0, 1]]), "1 of 2 are NaN"),
-        (np.array([[0, 0, np.inf], [0, -np.inf, 1]]), "2 of 2 are NaN"),
+        (np.array([[0, 0, np.inf], [0, -np.inf, 1]]), "2 rows, none of them finite"),
         (np.array([[0, 0, 1e300]]), "beyond float32"),
     ],
 )
@@ -68,6 +69,47 @@ def test_points_that_cannot_be_sent_are_refused_with_value_and_remedy(points: An
         checked_points(points)
     assert caught.value.argument == "points"
     assert isinstance(caught.value, ValueError)
+
+
+def test_points_of_an_image_travel_row_by_row_with_those_that_are_none() -> None:
+    image = np.arange(18, dtype=np.float32).reshape(2, 3, 3)
+    image[1, 1] = np.nan
+    np.testing.assert_array_equal(
+        np.frombuffer(points_request(image, {}).content, "<f4").reshape(-1, 3), image.reshape(-1, 3)
+    )
+
+
+def test_points_far_from_the_origin_travel_as_float64() -> None:
+    far = np.array([[5_400_000.0123, 1, 2], [5_400_000.5, np.nan, 2]])
+    request = points_request(far, {"seed": 1})
+    assert request.headers["Content-Type"] == "application/x-npy"
+    np.testing.assert_array_equal(np.load(io.BytesIO(request.content)), far)
+    assert points_request(far.astype(np.float32), {}).headers["Content-Type"] == "application/octet-stream"
+
+
+def test_what_belongs_to_each_point_travels_in_a_form() -> None:
+    points = np.zeros((4, 3), np.float32)
+    request = points_request(points, {"seed": 1}, view_index=[0, 1, 1, 0], normals=np.eye(4, 3))
+    payload = decoder_for(request.headers["Content-Type"])(bytearray(request.content), 10)
+    assert payload.view_index is not None
+    assert payload.normals is not None
+    assert payload.view_index.tolist() == [0, 1, 1, 0]
+    assert payload.normals.tolist() == np.eye(4, 3).tolist()
+
+
+@pytest.mark.parametrize(
+    ("beside", "name"),
+    [
+        ({"view_index": [0, 1]}, "view_index"),
+        ({"view_index": [0.0] * 4}, "view_index"),
+        ({"normals": np.zeros((4, 2))}, "normals"),
+        ({"normals": np.zeros((3, 3))}, "normals"),
+    ],
+)
+def test_other_numbers_of_what_belongs_to_each_point_are_refused_here(beside: dict[str, Any], name: str) -> None:
+    with pytest.raises(InvalidArgument, match="each of the 4 points") as caught:
+        points_request(np.zeros((4, 3)), {}, **beside)
+    assert caught.value.argument == name
 
 
 def test_the_client_has_the_options_of_the_wire_and_no_other() -> None:

@@ -5,7 +5,9 @@ from __future__ import annotations
 import io
 import json
 import struct
+import tracemalloc
 import zlib
+from collections.abc import Callable
 from typing import Any
 
 import httpx
@@ -17,7 +19,9 @@ from numpy.typing import NDArray
 from PIL import Image
 from pypcd4.pypcd4 import Encoding, PointCloud
 
-from service.payloads import Payload, decoder_for
+from client.form import File, encode_form
+from service.payloads import Payload, build_query, decoder_for, parse_options
+from tesnet.errors import TooManyPoints
 from tests.depth_scene import SIZE, box_on_table
 from tests.service.test_contract import steady
 from tests.service.wire import npy, post_octets, problem_of
@@ -248,10 +252,37 @@ BAD_FORMS: dict[str, tuple[dict[str, bytes], Any, int, str]] = {
         400,
         "damaged",
     ),
-    "a bomb": ({"depth": bomb(3000)}, CAMERA, 413, "3000 x 3000 pixels (limit 4000000"),
+    "a bomb": ({"depth": bomb(3000)}, CAMERA, 413, "3000 x 3000 pixels (limit 8500000"),
     "too many points in a depth image": ({"depth": png(np.ones((1001, 1000), np.uint16))}, CAMERA, 413, "1001000"),
     "mask of another size": ({"depth": DEPTH, "mask": png(VIEW.mask[1:].astype(np.uint8))}, CAMERA, 422, "200 x 159"),
-    "mask of 16 bits": ({"depth": DEPTH, "mask": DEPTH}, CAMERA, 422, "16 bits"),
+    "label without a mask": ({"depth": DEPTH}, {**CAMERA, "target": {"label": 1}}, 422, "no file `mask`"),
+    "intrinsics of shares": (
+        {"depth": DEPTH},
+        {"intrinsics": {"fx": 0.9, "fy": 0.9, "cx": 0.5, "cy": 0.5}},
+        422,
+        "shares of the image's size",
+    ),
+    "counts of millimetres as metres": ({"depth": DEPTH}, {**CAMERA, "depth_scale": 1.0}, 422, "depth_scale"),
+    "stride of nothing": ({"depth": DEPTH}, {**CAMERA, "stride": 0}, 422, "stride"),
+    "view index of another length": (
+        {"cloud": npy(np.zeros((9, 3), np.float32)), "view_index": npy(np.zeros(8, np.uint8))},
+        {},
+        422,
+        "8 entries for 9",
+    ),
+    "view index of an unknown viewpoint": (
+        {"cloud": npy(np.zeros((9, 3), np.float32)), "view_index": npy(np.ones(9, np.uint8))},
+        {},
+        422,
+        "1 viewpoints",
+    ),
+    "normals of pairs": (
+        {"cloud": npy(np.zeros((9, 3), np.float32)), "normals": npy(np.zeros((9, 2), np.float32))},
+        {},
+        422,
+        "normals",
+    ),
+    "no finite point": ({"cloud": npy(np.full((9, 3), np.nan, np.float32))}, {}, 422, "all of them NaN"),
     "mask that is none": ({"depth": DEPTH, "mask": b"mask"}, CAMERA, 400, "mask"),
     "mask and target": (
         {"depth": DEPTH, "mask": MASK},
@@ -301,7 +332,171 @@ def test_a_pcd_without_some_pixels_counts_its_rows_for_targets(http: httpx.Clien
     expected = post(
         http, {"cloud": npy(cloud)}, {**OPTIONS, "target": {"indices": np.flatnonzero(cloud[:, 2] > 0.001).tolist()}}
     ).json()
+    assert answer["counts"].pop("ignored_points") == len(rows) - len(cloud)
+    assert expected["counts"].pop("ignored_points") == 0
     assert steady(answer) == steady(expected)
+
+
+def test_depth_as_npy_of_metres_and_of_counts_is_the_depth_of_a_png(http: httpx.Client) -> None:
+    view = box_on_table()
+    options = {**view.camera, "up": [0, 0, 1], "support_height": 0.0, "max_candidates": 300}
+    expected = steady(post(http, {"depth": png(view.counts)}, options).json())
+    assert expected["grasps"]
+    metres = np.where(view.counts, view.counts / 1000, -1.0)
+    for depth in (view.counts.astype(np.int32), view.counts[..., None], metres):
+        assert steady(post(http, {"depth": npy(depth)}, options).json()) == expected
+    gaps = np.where(view.counts, metres, np.nan)
+    assert steady(post(http, {"depth": npy(gaps)}, {**options, "depth_scale": 0.5}).json()) == expected
+
+
+@pytest.mark.parametrize("dtype", [np.uint8, np.uint16])
+def test_a_label_of_a_mask_is_the_target(http: httpx.Client, dtype: type) -> None:
+    view = box_on_table()
+    options = {**view.camera, "up": [0, 0, 1], "support_height": "auto", "max_candidates": 300}
+    expected = post(http, {"depth": png(view.counts), "mask": png(view.mask.astype(np.uint8))}, options).json()
+    label = 3 if dtype == np.uint8 else 40_000
+    labels: NDArray[Any] = np.where(view.mask, label, 7).astype(dtype)
+    for mask in (png(labels), npy(labels)):
+        answer = post(http, {"depth": png(view.counts), "mask": mask}, {**options, "target": {"label": label}}).json()
+        assert steady(answer) == steady(expected)
+    absent = post(http, {"depth": png(view.counts), "mask": png(labels)}, {**options, "target": {"label": 9}}).json()
+    assert absent["grasps"] == []
+    words = f"no pixel of the mask has; labels there: {min(label, 7)}, {max(label, 7)}"
+    assert any(words in warning for warning in absent["warnings"])
+
+
+def test_a_stride_uses_every_so_many_th_pixel(http: httpx.Client) -> None:
+    view = box_on_table()
+    coarse = np.zeros_like(view.counts)
+    coarse[::3, ::3] = view.counts[::3, ::3]
+    expected = post(http, {"depth": png(coarse)}, view.camera).json()
+    answer = post(http, {"depth": png(view.counts)}, {**view.camera, "stride": 3}).json()
+    assert answer["counts"]["points"] == np.count_nonzero(coarse)
+    assert answer["grasps"] == expected["grasps"]
+
+
+def test_a_pose_of_three_decimals_is_made_orthonormal(http: httpx.Client) -> None:
+    view = box_on_table()
+    rounded = {**view.camera, "T_cloud_camera": view.T_cloud_camera.matrix.round(3).tolist()}
+    answer = post(http, {"depth": png(view.counts)}, {**rounded, "up": [0, 0, 1], "support_height": 0.002}).json()
+    assert answer["grasps"]
+    coarse = {**view.camera, "T_cloud_camera": view.T_cloud_camera.matrix.round(1).tolist()}
+    assert problem_of(post(http, {"depth": png(view.counts)}, coarse), 422, "decimals").field == "T_cloud_camera"
+
+
+def test_the_limit_of_points_concerns_those_that_matter() -> None:
+    decode = form_decoder({"cloud": npy(np.linspace(0, 1, 300, dtype=np.float32).reshape(100, 3))})
+    for options, count in (({}, 100), ({"workspace": {"min": [-1, -1, -1], "max": [0.1, 2, 2]}}, 10)):
+        payload = decode(options)
+        build_query(payload, parse_options(payload.options), count)
+        with pytest.raises(TooManyPoints, match=rf"{count} points \(limit {count - 1}\)"):
+            build_query(payload, parse_options(payload.options), count - 1)
+
+
+def test_an_image_of_eight_million_pixels_takes_little_more_memory_than_its_points() -> None:
+    image = np.full((2160, 3840), 500, np.uint16)
+    decode = form_decoder({"depth": npy(image)})
+    options = {"intrinsics": {"fx": 2000.0, "fy": 2000.0, "cx": 1920.0, "cy": 1080.0}}
+    decode(options)
+    tracemalloc.start()
+    try:
+        payload = decode(options)
+        points = payload.points.nbytes
+        assert tracemalloc.get_traced_memory()[1] < 2.5 * points
+    finally:
+        tracemalloc.stop()
+    assert len(payload.points) == image.size
+
+
+def test_the_viewpoint_of_a_file_is_used_unless_another_one_is_given(http: httpx.Client, cloud: Cloud) -> None:
+    file = PointCloud.from_xyz_points(cloud)
+    file.metadata.viewpoint = (*OPTIONS["viewpoint"], 1.0, 0.0, 0.0, 0.0)
+    content = io.BytesIO()
+    file.save(content, Encoding.BINARY)
+    without = {name: value for name, value in OPTIONS.items() if name != "viewpoint"}
+    expected = post(http, {"cloud": npy(cloud)}, OPTIONS).json()
+    answer = post(http, {"cloud": content.getvalue()}, without).json()
+    assert answer["grasps"] == expected["grasps"]
+    assert answer["warnings"] == ["viewpoint is that of the file: [0.35, 0, 0.5]"]
+    other = post(http, {"cloud": content.getvalue()}, {**OPTIONS, "viewpoint": [0, 0.1, 0.5]}).json()
+    assert other["warnings"] == ["the viewpoint [0.35, 0, 0.5] of the file is ignored, since viewpoint is given"]
+
+
+def test_view_index_and_normals_mean_the_same_in_every_body(http: httpx.Client, cloud: Cloud) -> None:
+    views = {**OPTIONS, "viewpoint": [OPTIONS["viewpoint"], [-0.35, 0, 0.5]]}
+    index = (cloud[:, 0] < 0).astype(np.int32)
+    normals = np.where(cloud[:, 2:] > 0.001, cloud, 0).astype(np.float32)
+    plain = steady(post(http, {"cloud": npy(cloud)}, views).json())
+    for name, array in (("view_index", index), ("normals", normals)):
+        told = steady(post(http, {"cloud": npy(cloud), name: npy(array)}, views).json())
+        assert told["grasps"] != plain["grasps"]
+        in_text = steady(post(http, {"cloud": npy(cloud), name: json.dumps(array.tolist()).encode()}, views).json())
+        in_json = steady(http.post("/grasps", json={"points": cloud.tolist(), name: array.tolist(), **views}).json())
+        assert told == in_text == in_json
+        tensors = [
+            {"name": "points", "datatype": "FP32", "shape": list(cloud.shape), "data": cloud.ravel().tolist()},
+            {
+                "name": name,
+                "datatype": "INT32" if name == "view_index" else "FP32",
+                "shape": list(array.shape),
+                "data": array.ravel().tolist(),
+            },
+        ]
+        body = {"inputs": tensors, "parameters": {key: json.dumps(value) for key, value in views.items()}}
+        outputs = http.post("/v2/models/tesnet/infer", json=body).json()["outputs"]
+        scores = next(output["data"] for output in outputs if output["name"] == "scores")
+        assert scores == [grasp["score"] for grasp in told["grasps"]]
+
+
+def test_a_far_cloud_has_the_grasps_of_a_near_one(http: httpx.Client, cloud: Cloud) -> None:
+    offset = np.array([460_000.0, 5_402_000.0, 100.0])
+    exact = cloud.astype(np.float64)
+    near = post(http, {"cloud": npy(exact)}, {**OPTIONS, "max_grasps": 3}).json()
+    place = {"viewpoint": (OPTIONS["viewpoint"] + offset).tolist(), "support_height": 100.0}
+    options = {**OPTIONS, **place, "max_grasps": 3}
+    bodies = [
+        post(http, {"cloud": npy(exact + offset)}, options),
+        http.post("/grasps", json={"points": (exact + offset).tolist(), **options}),
+    ]
+    assert near["grasps"]
+    for answer in bodies:
+        found = answer.json()
+        assert [grasp["score"] for grasp in found["grasps"]] == pytest.approx(
+            [grasp["score"] for grasp in near["grasps"]], abs=1e-3
+        )
+        for far_grasp, near_grasp in zip(found["grasps"], near["grasps"], strict=True):
+            np.testing.assert_allclose(far_grasp["position"] - offset, near_grasp["position"], atol=1e-5)
+
+
+def test_what_looks_like_a_mistake_is_a_warning(http: httpx.Client, cloud: Cloud) -> None:
+    view = box_on_table()
+    k = view.camera["intrinsics"]
+    shifted = {**view.camera, "intrinsics": {**k, "cx": 60.0}}
+    exchanged = {**view.camera, "intrinsics": {**k, "cx": 80.0, "cy": 100.0}}
+    suspicions = {
+        "cx and cy exchanged": ({"depth": png(view.counts)}, exchanged),
+        "off the middle": ({"depth": png(view.counts)}, shifted),
+        "0.0001": ({"depth": png(10 * view.counts)}, view.camera),
+        "1/5000 m": ({"depth": png(5 * view.counts)}, view.camera),
+        "centimetres": ({"cloud": npy(cloud[cloud[:, 2] > 0.001] * np.float32(100))}, {"viewpoint": [35, 0, 50]}),
+        "inches": ({"cloud": npy(cloud[cloud[:, 2] > 0.001] * np.float32(39.37))}, {"viewpoint": [14, 0, 20]}),
+        "reverse it": ({"cloud": npy(cloud)}, {**OPTIONS, "up": [0, 0, -1]}),
+    }
+    for words, (files, options) in suspicions.items():
+        answer = post(http, files, options)
+        assert answer.status_code == 200, answer.text
+        assert any(words in warning for warning in answer.json()["warnings"]), (words, answer.json()["warnings"])
+
+
+def form_decoder(files: dict[str, bytes]) -> Callable[[dict[str, Any]], Payload]:
+    """Decodes a form of these files and of options."""
+
+    def decode(options: dict[str, Any]) -> Payload:
+        parts = [File(name, f"{name}.bin", content) for name, content in files.items()]
+        content_type, body = encode_form([*parts, File("options", None, json.dumps(options).encode())])
+        return decoder_for(content_type)(bytearray(body), 1_000_000)
+
+    return decode
 
 
 def test_the_service_is_well_after_bad_forms(http: httpx.Client) -> None:

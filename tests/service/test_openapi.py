@@ -8,6 +8,7 @@ from typing import Any
 import httpx
 
 from service.schemas import DepthOptions, GraspOptions, GraspRequest
+from tesnet import formats
 
 
 def test_the_documentation_covers_bodies_options_and_problems(http: httpx.Client) -> None:
@@ -26,7 +27,8 @@ def test_the_documentation_covers_bodies_options_and_problems(http: httpx.Client
     }
     assert set(post["responses"]["200"]["content"]) == {"application/json", "application/x-npz"}
     form = post["requestBody"]["content"]["multipart/form-data"]["schema"]["properties"]
-    assert set(form) == {"cloud", "depth", "mask", "options"}
+    assert set(form) == {"cloud", "depth", "mask", "view_index", "normals", "options"}
+    assert all(suffix in form["cloud"]["description"] for suffix in formats.SUFFIXES)
     assert set(document["components"]["schemas"]["DepthOptions"]["properties"]) == set(DepthOptions.model_fields)
     assert set(post["responses"]) == {"200", "400", "401", "406", "413", "415", "422", "429", "503", "504"}
     assert all(

@@ -152,3 +152,35 @@ def test_far_points_are_ignored_and_counted() -> None:
 def test_nothing_left_is_none(options: dict[str, Any]) -> None:
     assert cloud.prepare(ask(tabletop(0), **options), cloud.PreparationConfig(), CPU) is None
     assert cloud.prepare(ask(np.empty((0, 3))), cloud.PreparationConfig(), CPU) is None
+
+
+def facing_walls() -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Points on two walls of a thin box, which of two cameras saw each, and the outward normals.
+
+    Each camera looks along its wall, so that the other one lies more nearly along the normal's line.
+    """
+    rng = np.random.default_rng(4)
+    sides = np.repeat([1.0, -1.0], 1500)
+    points = np.column_stack([0.02 * sides, rng.uniform(-0.05, 0.05, (3000, 2))])
+    cameras = np.array([[0.1, 0.0, 0.6], [-0.1, 0.0, 0.6], [0.6, 0.0, 0.0], [-0.6, 0.0, 0.0]])
+    return points, cameras, sides
+
+
+@pytest.mark.parametrize("how", ["view_index", "normals"])
+def test_normals_are_turned_by_who_saw_the_point_or_by_those_that_are_given(how: str) -> None:
+    points, cameras, sides = facing_walls()
+    told: dict[str, Any] = (
+        {"view_index": np.where(sides > 0, 0, 1)} if how == "view_index" else {"normals": sides[:, None] * [3.0, 0, 0]}
+    )
+    ready = prepared(ask(points, viewpoints=cameras, up=UP, **told))
+    in_cloud = ready.T_cloud_canonical.apply(ready.points.numpy())
+    outward = ready.T_cloud_canonical.rotate(ready.normals.numpy())[:, 0] * np.sign(in_cloud[:, 0])
+    assert (outward > 0.9).mean() > 0.95
+    assert (ready.normals * ready.view_directions).sum(dim=1).min() > -0.2
+
+
+def test_normals_of_zeros_leave_the_orientation_to_the_viewpoints() -> None:
+    points, cameras, _ = facing_walls()
+    plain = prepared(ask(points, viewpoints=cameras, up=UP))
+    same = prepared(ask(points, viewpoints=cameras, up=UP, normals=np.zeros_like(points)))
+    assert torch.equal(plain.normals, same.normals)

@@ -190,8 +190,11 @@ def test_a_careful_query_has_no_warnings() -> None:
         (ask(tabletop(0), up=UP), "viewpoint not given"),
         (ask(tabletop(0), viewpoints=CAMERA), "up not given"),
         (tabletop_query(points=STRANGE_CLOUDS["outliers"]), "points farther than 10 m"),
-        (tabletop_query(points=tabletop(0) + np.array([1e5, 0, 0])), "kept to 7.8 mm only: use"),
-        (tabletop_query(points=tabletop(0) + np.array([1e9, 0, 0])), "kept to 6.4e+04 mm only: use"),
+        (tabletop_query(points=np.float32(tabletop(0) + np.array([1e5, 0, 0]))), "kept to 7.8 mm only: use"),
+        (
+            tabletop_query(points=(tabletop(0) + np.array([1e9, 0, 0])).astype(np.float32)),
+            "kept to 6.4e+04 mm only: use",
+        ),
     ],
 )
 def test_what_the_caller_should_know_is_a_warning(query: GraspQuery, says: str) -> None:

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import re
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -9,7 +10,8 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tesnet.errors import InvalidQuery, TesnetError
-from tesnet.query import ApproachCone, box_option
+from tesnet.geometry import Box
+from tesnet.query import NO_VIEWPOINT, ApproachCone, box_option
 from tests.tesnet.scenes import UP, ask
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
@@ -63,6 +65,16 @@ BAD_OPTIONS: list[tuple[str, dict[str, Any], str]] = [
     ("num_approach_points", {"num_approach_points": 1025}, "is 1025; .* between 1 and 1024"),
     ("max_candidates", {"max_candidates": 0}, "is 0; .* between 1 and 20000"),
     ("max_candidates", {"max_candidates": 20_001}, "is 20001; .* between 1 and 20000"),
+    ("view_index", {"view_index": np.zeros(49, np.uint8)}, r"shape \(49,\); give a whole number for each of the 50"),
+    ("view_index", {"view_index": np.zeros(50)}, "array of float64"),
+    (
+        "view_index",
+        {"view_index": np.full(50, 1)},
+        "from 1 to 1, but there are 1 viewpoints; count them from 0",
+    ),
+    ("view_index", {"view_index": np.full(50, -1)}, "reaches from -1 to -1"),
+    ("normals", {"normals": np.zeros((50, 2))}, r"shape \(50, 2\); give x, y, z for each of the 50 points"),
+    ("normals", {"normals": np.full((50, 3), np.nan)}, "hold NaN or an infinity; give zeros"),
     ("unseen", {"unseen": "maybe"}, "is 'maybe'; valid: free, occupied"),
     ("seed", {"seed": -1}, "is -1; .* between 0 and 9223372036854775807"),
     ("seed", {"seed": 2**63}, "is 9223372036854775808; .* between 0 and"),
@@ -163,3 +175,39 @@ def test_directions_become_unit_vectors_and_limits_are_inclusive() -> None:
 def test_whole_numbers_of_numpy_are_whole_numbers() -> None:
     query = ask(POINTS, max_grasps=np.int64(3), seed=np.uint32(7), min_score=np.float32(0.5))
     assert query.max_grasps == 3
+
+
+@given(st.sampled_from([0.0, 63.0, 65.0, 1e4, 5.4e6, -1e8]), st.integers(0, 100))
+def test_a_far_cloud_of_float64_keeps_its_detail_and_moves_what_comes_with_it(distance: float, seed: int) -> None:
+    offset = distance * np.array([1.0, 0.5, -0.25])
+    points = np.random.default_rng(seed).uniform(-0.1, 0.1, (50, 3))
+    far = ask(
+        points + offset,
+        viewpoints=offset + UP,
+        up=UP,
+        workspace=Box(offset - 1, offset + 1),
+        target=Box(offset - 2, offset + 2),
+        support_height=0.05 + float(offset @ UP),
+    )
+    assert (far.origin is not None) == (abs(distance) > 64)
+    rounded = np.spacing(np.float32(1.0 if far.origin is not None else max(abs(distance), 1.0)))
+    spacing = float(np.spacing(2 * max(abs(distance), 1.0)) + rounded)
+    np.testing.assert_allclose(far.points + far.offset, points + offset, atol=4 * spacing)
+    assert far.viewpoints is not None
+    assert far.workspace is not None
+    assert isinstance(far.target, Box)
+    assert isinstance(far.support_height, float)
+    np.testing.assert_allclose(far.viewpoints + far.offset, [offset + UP], atol=4 * spacing)
+    np.testing.assert_allclose(far.workspace.minimum + far.offset, offset - 1, atol=4 * spacing)
+    np.testing.assert_allclose(far.target.maximum + far.offset, offset + 2, atol=4 * spacing)
+    assert far.support_height + far.offset @ UP == pytest.approx(0.05 + float(offset @ UP), abs=4 * spacing)
+    again = replace(far, max_grasps=3)
+    np.testing.assert_array_equal(again.points, far.points)
+    np.testing.assert_array_equal(again.viewpoints, far.viewpoints)
+
+
+def test_the_origin_as_default_viewpoint_is_told_of_a_far_cloud_too() -> None:
+    far = ask(POINTS + 1e5)
+    assert far.notes == (NO_VIEWPOINT,)
+    np.testing.assert_array_equal(far.viewpoints, [-far.offset])
+    assert ask(POINTS).notes == ()

@@ -171,3 +171,18 @@ def test_a_random_pose_that_stays_draws_four_numbers() -> None:
     rng, twin = np.random.default_rng(7), np.random.default_rng(7)
     assert_same(Pose.random(rng), Pose.from_quaternion(twin.standard_normal(4), np.zeros(3)))
     assert rng.random() == twin.random()
+
+
+@given(st.integers(0, 2**31), st.integers(3, 9))
+def test_a_rounded_matrix_gives_the_rotation_that_it_was(seed: int, decimals: int) -> None:
+    rng = np.random.default_rng(seed)
+    pose = Pose.look_at(rng.normal(size=3), rng.normal(size=3), rng.normal(size=3))
+    found = Pose.nearest(pose.matrix.round(decimals))
+    np.testing.assert_allclose(found.rotation, pose.rotation, atol=2 * 10.0**-decimals)
+
+
+def test_what_is_no_rotation_stays_refused() -> None:
+    for scale in (0.99, 1.003, -1.0):
+        matrix = np.diag([scale, scale, scale, 1.0])
+        with pytest.raises(ValueError, match="no rotation matrix"):
+            Pose.nearest(matrix)
