@@ -13,9 +13,11 @@ import torch
 from torch import Tensor
 
 from tesnet.geometry import Box, Pose
+from tesnet.obstacles import Obstacles
 from tesnet.points import (
     drop_points,
     estimate_normals,
+    members_of_cells,
     nearest_neighbours,
     orient_normals,
     statistical_outliers,
@@ -28,6 +30,12 @@ MINIMUM_POINTS = 32
 
 SUPPORT_NOISE = 0.005
 """Points lower than this above the support plane are the plane's own, as a camera sees it, and are dropped."""
+
+_LONGEST_HAND = 0.35
+"""Metres from a point within which lies all of a hand that approaches it."""
+
+_SURROUNDINGS = 3
+_FEWEST_TOGETHER = 4
 
 _UPRIGHT = 0.5
 """A side of the workspace stands upright, and bounds what was seen sideways, where the cosine of its normal with `up`
@@ -76,6 +84,8 @@ class PreparedCloud:
             was observed sideways: those of the workspace that stand upright. None of them without `up`.
         T_cloud_canonical: back to the frame of the query.
         on_target: (P,) mask of the points that candidates may come from; None is all of them.
+        unsought: what else was posted near the points, outside the workspace or beyond `max_points`, on the same grid:
+            no grasp is looked for there, but the hand must not meet it.
         dropped_far, dropped_surplus: points ignored because of `max_extent` and of `max_points`.
     """
 
@@ -90,6 +100,7 @@ class PreparedCloud:
     sides: Tensor
     T_cloud_canonical: Pose
     on_target: Tensor | None = None
+    unsought: Obstacles | None = None
     dropped_far: int = 0
     dropped_surplus: int = 0
 
@@ -102,7 +113,9 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
 
     A support height that is still to be found (`tesnet.support`) counts as none.
     """
-    table = crop(_columns(query).to(device), query)
+    posted = above_support(_columns(query).to(device), query)
+    sought = in_workspace(posted, query)
+    table = posted[sought]
     if len(table) == 0:
         return None
     near = (table[:, :3] - table[:, :3].median(dim=0).values).norm(dim=1) <= config.max_extent
@@ -113,24 +126,19 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     viewpoints = torch.zeros(1, 3) if query.viewpoints is None else torch.tensor(query.viewpoints)
     up = None if query.up is None else torch.tensor(query.up)
     T_cloud_canonical = canonical_frame(points, viewpoints.to(device), None if up is None else up.to(device))
-    rotation = torch.tensor(T_cloud_canonical.rotation)
-    origin = torch.tensor(T_cloud_canonical.translation)
 
     def to_canonical(positions: Tensor) -> Tensor:
-        return ((positions.double() - origin.to(positions.device)) @ rotation.to(positions.device)).float()
+        return in_canonical_frame(positions, T_cloud_canonical)
 
     table = voxel_downsample(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config.voxel_size)
+    a_cell = len(points) / len(table)
     viewpoints = to_canonical(viewpoints).to(device)
     on_target = _on_target(query, table, T_cloud_canonical)
-    outward = None if _outward(query) is None else table[:, -3:] @ rotation.to(table)
+    kept = _within_limit(table[:, :3], _middle(query, table, on_target, T_cloud_canonical), config.max_points)
+    others = torch.cat([to_canonical(posted[~sought, :3]), table[~kept, :3]])
+    table, on_target = table[kept], None if on_target is None else on_target[kept]
+    outward = None if _outward(query) is None else table[:, -3:] @ torch.tensor(T_cloud_canonical.rotation).to(table)
     points = table[:, :3].contiguous()
-    dropped_surplus = max(0, len(points) - config.max_points)
-    if dropped_surplus:
-        wanted = points if on_target is None or not bool(on_target.any()) else points[on_target]
-        distance = (points - wanted.median(dim=0).values).norm(dim=1)
-        kept = distance.argsort(stable=True)[: config.max_points].sort().values
-        points, on_target = points[kept], None if on_target is None else on_target[kept]
-        outward = None if outward is None else outward[kept]
 
     neighbours = nearest_neighbours(points, max(config.normal_neighbours, config.outlier_neighbours + 1))
     keep = ~statistical_outliers(points, neighbours[:, : config.outlier_neighbours + 1], config.outlier_std_ratio)
@@ -149,13 +157,14 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
         spectrum=spectrum,
         view_directions=view_directions,
         viewpoints=viewpoints,
-        up=None if up is None else (up @ rotation).float().to(device),
+        up=None if up is None else (up @ torch.tensor(T_cloud_canonical.rotation)).float().to(device),
         support_height=support_height,
         sides=_sides(query, T_cloud_canonical).to(device),
         T_cloud_canonical=T_cloud_canonical,
         on_target=on_target,
+        unsought=_unsought(points, others, config.voxel_size, a_cell),
         dropped_far=dropped_far,
-        dropped_surplus=dropped_surplus,
+        dropped_surplus=int((~kept).sum()),
     )
 
 
@@ -182,18 +191,69 @@ def _outward(query: GraspQuery) -> Tensor | None:
 
 def crop(points: Tensor, query: GraspQuery) -> Tensor:
     """Rows (N, 3 or more), beginning with x, y, z, inside the query's workspace and clear of its support plane."""
-    if query.workspace is not None:
-        points = points[_inside(points, query.workspace)]
-    if isinstance(query.support_height, float) and query.up is not None:
-        heights = points[:, :3] @ torch.tensor(query.up, dtype=points.dtype, device=points.device)
-        points = points[heights >= query.support_height + SUPPORT_NOISE]
-    return points
+    points = above_support(points, query)
+    return points[in_workspace(points, query)]
+
+
+def above_support(points: Tensor, query: GraspQuery) -> Tensor:
+    """Rows (N, 3 or more), beginning with x, y, z, that do not belong to the query's support plane or lie below it."""
+    if query.up is None or not isinstance(query.support_height, float):
+        return points
+    heights = points[:, :3] @ torch.tensor(query.up, dtype=points.dtype, device=points.device)
+    return points[heights >= query.support_height + SUPPORT_NOISE]
+
+
+def in_workspace(points: Tensor, query: GraspQuery) -> Tensor:
+    """Mask (N,) of the rows inside the query's workspace."""
+    if query.workspace is None:
+        return torch.ones(len(points), dtype=torch.bool, device=points.device)
+    return _inside(points, query.workspace)
+
+
+def _middle(query: GraspQuery, table: Tensor, on_target: Tensor | None, T_cloud_canonical: Pose) -> Tensor:
+    """Where grasps matter most, (3,): the middle of the target, or of the workspace, or of all rows (V, 3 or more)."""
+    if on_target is not None and bool(on_target.any()):
+        return table[on_target, :3].median(dim=0).values
+    if query.workspace is None:
+        return table[:, :3].median(dim=0).values
+    middle = torch.tensor((query.workspace.minimum + query.workspace.maximum) / 2, device=table.device)
+    return in_canonical_frame(middle[None], T_cloud_canonical)[0]
+
+
+def _within_limit(points: Tensor, middle: Tensor, limit: int) -> Tensor:
+    """Mask (V,) of the points (V, 3) nearest to the middle, so many as may be."""
+    kept = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    if len(points) > limit:
+        kept[(points - middle).norm(dim=1).argsort(stable=True)[limit:]] = False
+    return kept
+
+
+def _unsought(points: Tensor, others: Tensor, voxel_size: float, a_cell: float) -> Obstacles | None:
+    """The cells of the other points that a hand at the points may meet, but none of isolated points (flying pixels).
+
+    Isolated are those whose surroundings, a cube of `_SURROUNDINGS` cells' edge, hold fewer than `_FEWEST_TOGETHER`
+    points, or under a tenth of what a surface that crosses it holds where there are `a_cell` points in a cell.
+    """
+    near = ((others >= points.amin(dim=0) - _LONGEST_HAND) & (others <= points.amax(dim=0) + _LONGEST_HAND)).all(dim=1)
+    others = others[near]
+    if len(others) == 0:
+        return None
+    surroundings, counts = members_of_cells((others / (_SURROUNDINGS * voxel_size)).floor().long())
+    least = min(_FEWEST_TOGETHER, 0.1 * _SURROUNDINGS**2 * a_cell)
+    others = others[counts[surroundings] >= least]
+    return Obstacles.of(voxel_downsample(others, voxel_size)) if len(others) else None
 
 
 def _inside(points: Tensor, box: Box) -> Tensor:
     low = torch.tensor(box.minimum, dtype=points.dtype, device=points.device)
     high = torch.tensor(box.maximum, dtype=points.dtype, device=points.device)
     return ((points[:, :3] >= low) & (points[:, :3] <= high)).all(dim=1)
+
+
+def in_canonical_frame(points: Tensor, T_cloud_canonical: Pose) -> Tensor:
+    """Points (N, 3) of the query's frame in the canonical one."""
+    rotation = torch.tensor(T_cloud_canonical.rotation, device=points.device)
+    return ((points.double() - torch.tensor(T_cloud_canonical.translation, device=points.device)) @ rotation).float()
 
 
 def canonical_frame(points: Tensor, viewpoints: Tensor, up: Tensor | None) -> Pose:

@@ -6,14 +6,19 @@ metres; everything in the cloud's canonical frame.
 
 from __future__ import annotations
 
+import itertools
+import math
+from collections.abc import Callable
 from typing import Literal
 
 import torch
 from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
-from tesnet.geometry import Extent, Gripper, Part
+from tesnet.geometry import Gripper, Part
+from tesnet.obstacles import Obstacles
 from tesnet.points import points_in_grasp_frames
+from tesnet.swept import inside_hand, reach_of
 from tesnet.visibility import depth_behind
 
 APPROACH_DISTANCE = 0.05
@@ -28,14 +33,22 @@ BORDER = 0.005
 REACH_BEYOND = 0.04
 """How far beyond the workspace things are taken to go on."""
 
+HELD_DEPTH = 0.004
+HELD_POINTS = 10
+"""Of a hand that a robot would drive into things: so many posted points lie so deep in it."""
+
 _BLOCK = 4_000_000
 _COARSE_STRIDE = 6
 
 
 def blocked(
-    cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, unseen: Literal["free", "occupied"]
+    cloud: PreparedCloud,
+    Ts_canonical_grasp: Tensor,
+    gripper: Gripper,
+    unseen: Literal["free", "occupied"],
+    between: Callable[[], None] = lambda: None,
 ) -> Tensor:
-    """Mask (C,): the open hand meets an observed point on its way, or what a side of the workspace cuts off.
+    """Mask (C,): the open hand meets a posted point on its way, or what a side of the workspace cuts off.
 
     The latter is a guess, which counts only while it leaves a candidate.
 
@@ -44,10 +57,13 @@ def blocked(
         Ts_canonical_grasp: (C, 4, 4) TCP poses.
         gripper: the hand.
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
+        between: called between blocks of work of some milliseconds.
     """
     width = gripper.max_width
-    mask = in_collision(cloud.points, Ts_canonical_grasp, gripper, width, APPROACH_DISTANCE)
-    unsafe = in_collision(beyond(cloud), Ts_canonical_grasp, gripper, width, APPROACH_DISTANCE)
+    mask = in_collision(cloud.points, Ts_canonical_grasp, gripper, width, APPROACH_DISTANCE, between)
+    if cloud.unsought is not None:
+        mask |= _meets(cloud.unsought, Ts_canonical_grasp, gripper, ~mask, between)
+    unsafe = _meets(Obstacles.of(beyond(cloud)), Ts_canonical_grasp, gripper, ~mask, between)
     if not bool((mask | unsafe).all()):
         mask |= unsafe
     if unseen == "occupied":
@@ -55,8 +71,43 @@ def blocked(
     return mask
 
 
+def _meets(obstacles: Obstacles, poses: Tensor, gripper: Gripper, asked: Tensor, between: Callable[[], None]) -> Tensor:
+    """Mask (C,) of the poses (C, 4, 4), among those asked about, whose hand meets an obstacle on its way."""
+    met = torch.zeros_like(asked)
+    found = obstacles.count_in_hands(
+        poses[asked], gripper, gripper.max_width, distance=APPROACH_DISTANCE, between=between
+    )
+    met[asked] = found > 0
+    return met
+
+
+def holds(posted: Tensor, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Tensor:
+    """Mask (C,): posted points lie well inside the open hand at the grasp, `HELD_POINTS` or more `HELD_DEPTH` deep.
+
+    The last word on grasps that are to be returned: `blocked` looks at cells, and leaves out points that stand alone.
+
+    Args:
+        posted: (N, 3) every point of the query, its support's included.
+        Ts_canonical_grasp: (C, 4, 4) TCP poses.
+        gripper: the hand.
+    """
+    if len(Ts_canonical_grasp) == 0:
+        return torch.zeros(0, dtype=torch.bool, device=posted.device)
+    low, high = reach_of(gripper, gripper.max_width, 0.0)
+    radius = max(math.hypot(*corner) for corner in itertools.product(*zip(low, high, strict=True)))
+    origins = Ts_canonical_grasp[:, :3, 3]
+    near = ((posted >= origins.amin(dim=0) - radius) & (posted <= origins.amax(dim=0) + radius)).all(dim=1)
+    held = Obstacles.of(posted[near]).count_in_hands(Ts_canonical_grasp, gripper, gripper.max_width, depth=HELD_DEPTH)
+    return held >= HELD_POINTS
+
+
 def in_collision(
-    points: Tensor, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float, approach_distance: float
+    points: Tensor,
+    Ts_canonical_grasp: Tensor,
+    gripper: Gripper,
+    width: float,
+    approach_distance: float,
+    between: Callable[[], None] = lambda: None,
 ) -> Tensor:
     """Mask (C,): a point lies in the hand anywhere on its way to the grasp.
 
@@ -66,44 +117,21 @@ def in_collision(
         gripper: the hand.
         width: opening of the fingers.
         approach_distance: length of the straight approach, which ends in the grasp.
+        between: called between blocks of work of some milliseconds.
     """
     hit = torch.zeros(len(Ts_canonical_grasp), dtype=torch.bool, device=points.device)
     # Most collisions show with a few points already; the others are looked for with all of them.
     for some in (points[::_COARSE_STRIDE], points):
         open_rows = (~hit).nonzero()[:, 0]
         for rows in open_rows.split(max(1, _BLOCK // max(1, len(some)))):
+            between()
             hit[rows] = _hit(some, Ts_canonical_grasp[rows], gripper, width, approach_distance)
     return hit
 
 
 def _hit(points: Tensor, poses: Tensor, gripper: Gripper, width: float, approach_distance: float) -> Tensor:
     x, y, z = points_in_grasp_frames(points, poses)
-    x, y = x.abs_(), y.abs_()
-    hit = torch.zeros(len(poses), dtype=torch.bool, device=points.device)
-    for part in gripper.parts:
-        if part.side >= 0:  # seen by |y|, one finger is both
-            hit |= _swept(part, x, y, z, width, approach_distance).any(dim=1)
-    return hit
-
-
-def _swept(part: Part, x: Tensor, y: Tensor, z: Tensor, width: float, distance: float) -> Tensor:
-    """Mask (C, P) of the places (|x|, |y|, z), each (C, P), that a part passes on the last `distance` of its way.
-
-    Swept along z, a tapered part is as wide at each place as where it comes to rest. The rounding of a finger's tip is
-    left out: prepared points lie nearly as far apart as it is long.
-    """
-    inside = (z < part.front) & (z > part.back - distance) & (x < _extent(part.breadth, part.front, z, 0.5))
-    if part.side:
-        return inside & (y > width / 2) & (y < _extent(part.thickness, part.front, z, 1.0) + width / 2)
-    return inside & (y < _extent(part.thickness, part.front, z, 0.5))
-
-
-def _extent(extent: Extent, front: float, z: Tensor, share: float) -> Tensor | float:
-    """A share of a part's extent at each z (C, P)."""
-    if not extent.taper:
-        return share * extent.full
-    slope = share * (extent.full - extent.front) / extent.taper
-    return ((front - z) * slope + share * extent.front).clamp_(max=share * extent.full)
+    return inside_hand(x, y, z, gripper, width, approach_distance).any(dim=1)
 
 
 def beyond(cloud: PreparedCloud) -> Tensor:

@@ -27,6 +27,9 @@ GOOD_SCORE = 0.9
 FURTHER_SEARCHES = 4
 """At most so often, each time with four times as many approach points as the query names."""
 
+MOST_SCORED = 10_000
+"""Candidates in all further searches together: who asks for many at once has had them."""
+
 _SEED_STEP = 0x9E3779B97F4A7C15
 """Between the seeds of one query's searches: queries whose seeds follow each other share none."""
 
@@ -205,7 +208,7 @@ class GraspPredictor:
         clock.check()
         found, rejected = candidates.generate(prepared, query, self._candidates)
         clock.check()
-        blocked = collision.blocked(prepared, found.Ts_canonical_grasp, query.gripper, query.unseen)
+        blocked = collision.blocked(prepared, found.Ts_canonical_grasp, query.gripper, query.unseen, clock.check)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
 
     def _encode(self, proposals: Sequence[_Proposal]) -> list[Any]:
@@ -228,14 +231,13 @@ class GraspPredictor:
         clock.start()
         clock.check()
         found, scores = self._best_search(proposal, features)
-        ranked = ranking.rank(
-            scores,
-            found.free.Ts_canonical_grasp,
-            max_grasps=query.max_grasps,
-            min_score=query.min_score,
-            separation_translation=query.separation_translation,
-            separation_rotation_deg=query.separation_rotation_deg,
-        )
+        ranked = _ranked(found, scores, query)
+        posted = torch.from_numpy(query.points.copy()).to(self.device)
+        posted = cloud.in_canonical_frame(posted, prepared.T_cloud_canonical)
+        if bool(collision.holds(posted, found.free.Ts_canonical_grasp[ranked.indices], query.gripper).any()):
+            clear = ~collision.holds(posted, found.free.Ts_canonical_grasp, query.gripper)
+            found, scores = found.only(clear), scores[clear]
+            ranked = _ranked(found, scores, query)
         last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
         rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
         grasps = _grasps(query, prepared, found.free, scores, ranked.indices)
@@ -243,8 +245,8 @@ class GraspPredictor:
         return GraspResult(
             grasps=grasps,
             counts=_counts(query, (len(prepared), found.count, len(found.free), len(grasps)), rejected),
-            reason=None if len(grasps) else "below_min_score",
-            warnings=(*proposal.notes, *_answer_warnings(float(scores.max()), prepared, query)),
+            reason=_why_nothing(found) if len(grasps) == 0 else None,
+            warnings=(*proposal.notes, *_answer_warnings(float(scores.max()) if len(scores) else 0.0, prepared, query)),
             timings_ms=clock.laps_ms,
         )
 
@@ -258,7 +260,8 @@ class GraspPredictor:
         clock.lap("network")
         for number in range(1, FURTHER_SEARCHES + 1):
             # Where a search yields few candidates it has tried every approach point.
-            if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates:
+            enough = number * query.max_candidates > MOST_SCORED
+            if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates or enough:
                 break
             other = self._search(prepared, _further(query, number), clock)
             self._synchronise()
@@ -329,6 +332,12 @@ class _Found:
     count: int
     rejected: dict[str, int]
 
+    def only(self, clear: torch.Tensor) -> _Found:
+        """What is left when of the free candidates only those of the mask (F,) are free after all."""
+        blocked = int((~clear).sum())
+        rejected = self.rejected | {"collision": self.rejected["collision"] + blocked}
+        return _Found(self.free.select(clear), self.count, rejected)
+
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Proposal:
@@ -347,6 +356,23 @@ class _Proposal:
     found: _Found
     notes: list[str]
     clock: _Clock
+
+
+def _ranked(found: _Found, scores: torch.Tensor, query: GraspQuery) -> ranking.Ranking:
+    """The ranking of a search's free candidates, whose scores are (F,)."""
+    return ranking.rank(
+        scores,
+        found.free.Ts_canonical_grasp,
+        max_grasps=query.max_grasps,
+        min_score=query.min_score,
+        separation_translation=query.separation_translation,
+        separation_rotation_deg=query.separation_rotation_deg,
+    )
+
+
+def _why_nothing(found: _Found) -> Reason:
+    """Why a search whose candidates have been scored yields no grasp."""
+    return "below_min_score" if len(found.free) else "all_in_collision"
 
 
 def _further(query: GraspQuery, number: int) -> GraspQuery:

@@ -6,13 +6,14 @@ import sys
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
+from unittest.mock import Mock
 
 import numpy as np
 import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from tesnet import cloud, weights
+from tesnet import cloud, collision, weights
 from tesnet import predictor as predictor_module
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box
@@ -30,6 +31,7 @@ from tests.tesnet.scenes import (
     tabletop,
     tabletop_query,
 )
+from tests.tesnet.test_collision import depths
 
 RNG = np.random.default_rng(0)
 ALONG = np.linspace(-0.15, 0.15, 600)[:, None]
@@ -378,3 +380,83 @@ def test_the_number_of_threads_is_set_on_request(tmp_path: Path) -> None:
         [sys.executable, "-c", program, str(tmp_path / "a.safetensors")], capture_output=True, text=True, check=True
     )
     assert done.stdout.strip() == "3"
+
+
+def table_top(extent: float, pitch: float = 0.0045) -> Array:
+    """A square of points with nothing on it, noisy by half a millimetre."""
+    rng = np.random.default_rng(0)
+    along = np.arange(-extent / 2, extent / 2, pitch)
+    flat = np.stack(np.meshgrid(along, along), axis=-1).reshape(-1, 2)
+    return np.column_stack([flat, rng.normal(0, 0.0005, len(flat))])
+
+
+def tall_box() -> Array:
+    """A box of 10 x 10 x 30 cm whose top and nearer sides were seen, and a table of 0.6 m."""
+    rng = np.random.default_rng(0)
+    sides = [
+        np.column_stack([rng.uniform(-0.05, 0.05, (15_000, 1)), np.full(15_000, -0.05), rng.uniform(0, 0.3, 15_000)]),
+        np.column_stack([np.full(15_000, 0.05), rng.uniform(-0.05, 0.05, (15_000, 1)), rng.uniform(0, 0.3, 15_000)]),
+        np.column_stack([rng.uniform(-0.05, 0.05, (5_000, 2)), np.full(5_000, 0.3)]),
+    ]
+    return np.vstack([table_top(0.6), *sides]) + rng.normal(0, 0.0005, (sum(map(len, sides)) + len(table_top(0.6)), 3))
+
+
+CUT = Box(np.array([-0.2, -0.2, 0.02]), np.array([0.2, 0.2, 0.1]))
+"""Holds the foot of the tall box and cuts off what stands above it."""
+
+
+@pytest.mark.parametrize(
+    "query",
+    [
+        lambda: ask(table_top(0.7), viewpoints=[0, -0.4, 0.6]),
+        lambda: ask(tall_box(), viewpoints=[0.4, -0.5, 0.6], workspace=CUT),
+        lambda: ask(tall_box(), viewpoints=[0.4, -0.5, 0.6], up=UP, workspace=CUT, support_height=0.0),
+        lambda: ask(tall_box(), viewpoints=[0.4, -0.5, 0.6], up=UP, support_height=0.0, max_grasps=1000),
+    ],
+    ids=["a table wider than the limit of cells", "cut by the workspace", "cut over a support", "whole"],
+)
+@pytest.mark.parametrize("limit", [12_000, 1500])
+def test_no_returned_hand_holds_posted_points(query: Any, limit: int) -> None:
+    asked = query()
+    settings = configuration_of(fresh_network())
+    settings["preparation"]["max_points"] = limit
+    network = GraspPredictor(fresh_network().eval(), settings, (8.0, 0.5), predictor().model, torch.device("cpu"))
+    result = network.predict(asked)
+    for T in result.grasps.Ts_cloud_grasp:
+        assert int((depths(asked.points.astype(np.float64), T, PANDA.max_width) > 0.004).sum()) < 10
+    assert_sound(result, asked)
+
+
+def test_what_the_workspace_hides_is_met_on_the_way() -> None:
+    """The box's top stands over its foot; a hand that comes down over the foot would pass through it."""
+    asked = ask(tall_box(), viewpoints=[0.4, -0.5, 0.6], up=UP, workspace=CUT, support_height=0.0)
+    prepared = cloud.prepare(asked, predictor().preparation, torch.device("cpu"))
+    assert prepared is not None
+    assert prepared.unsought is not None
+    down = np.diag([1.0, -1.0, -1.0, 1.0])
+    down[:3, 3] = [0.0, 0.0, 0.15]
+    pose = torch.from_numpy((prepared.T_cloud_canonical.inverse().matrix @ down)[None]).float()
+    assert collision.blocked(prepared, pose, PANDA, "free").all()
+    assert not collision.blocked(replace(prepared, unsought=None), pose, PANDA, "free").any()
+
+
+def test_points_that_stand_alone_and_the_supports_own_block_nothing() -> None:
+    alone = np.array([[0.0, 0.0, z] for z in (0.16, 0.2)])
+    box = tall_box()
+    box = box[box[:, 2] < 0.1]
+    asked = ask(np.vstack([box, alone]), viewpoints=[0.4, -0.5, 0.6], up=UP, workspace=CUT, support_height=0.0)
+    prepared = cloud.prepare(asked, predictor().preparation, torch.device("cpu"))
+    assert prepared is not None
+    assert prepared.unsought is not None  # the lowest 2 cm of the box
+    heights = prepared.T_cloud_canonical.apply(prepared.unsought.points.double().numpy())[:, 2]
+    assert heights.min() > 0.005 - 1e-6
+    assert heights.max() < CUT.minimum[2] + 1e-6
+
+
+def test_a_collision_check_can_be_left_in_its_middle(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr("tesnet.collision._BLOCK", 1000)
+    between = Mock(side_effect=[None, GaveUp])
+    ready = cloud.prepare(tabletop_query(), predictor().preparation, torch.device("cpu"))
+    assert ready is not None
+    with pytest.raises(GaveUp):
+        collision.blocked(ready, torch.eye(4).expand(5000, 4, 4), PANDA, "free", between)

@@ -1,0 +1,122 @@
+"""Points that a hand must not meet, sorted into blocks so that each hand is held against those near it alone.
+
+Knows no query and no network. Vectorised torch; lengths in metres; points and poses in one frame.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tesnet.geometry import Gripper
+from tesnet.points import members_of_cells
+from tesnet.swept import inside_hand, reach_of
+
+BLOCK_SIZE = 0.04
+"""Edge of a block: several lie within a hand, and one holds some dozen cells of a surface."""
+
+_POSES_AT_ONCE = 512
+_PAIRS_AT_ONCE = 1_000_000
+"""Pairs of a hand and a point that are in memory at a time, some 40 MB."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Obstacles:
+    """O points in B blocks; make it with `Obstacles.of`.
+
+    Args:
+        points: (O, 3), the points of a block one after the other.
+        first, count: (B,) where a block begins and how many points it has.
+        centres, radii: (B, 3) and (B,) of a sphere about each block's points.
+    """
+
+    points: Tensor
+    first: Tensor
+    count: Tensor
+    centres: Tensor
+    radii: Tensor
+
+    @classmethod
+    def of(cls, points: Tensor) -> Obstacles:
+        """The points (O, 3) in blocks."""
+        if len(points) == 0:
+            none = torch.zeros(0, dtype=torch.long, device=points.device)
+            return cls(points, none, none, points, points.new_zeros(0))
+        block, count = members_of_cells((points / BLOCK_SIZE).floor().long())
+        order = block.argsort(stable=True)
+        points, block = points[order], block[order]
+        low = points.new_zeros(len(count), 3).scatter_reduce(
+            0, block[:, None].expand(-1, 3), points, "amin", include_self=False
+        )
+        high = points.new_zeros(len(count), 3).scatter_reduce(
+            0, block[:, None].expand(-1, 3), points, "amax", include_self=False
+        )
+        return cls(points, count.cumsum(0) - count, count, (low + high) / 2, (high - low).norm(dim=1) / 2)
+
+    def __len__(self) -> int:
+        return len(self.points)
+
+    def count_in_hands(
+        self,
+        poses: Tensor,
+        gripper: Gripper,
+        width: float,
+        *,
+        distance: float = 0.0,
+        depth: float = 0.0,
+        between: Callable[[], None] = lambda: None,
+    ) -> Tensor:
+        """(C,) how many of the points lie in each hand.
+
+        Args:
+            poses: (C, 4, 4) TCP poses.
+            gripper: the hand.
+            width: opening of the fingers.
+            distance: length of the straight way, ending in the pose, on which a point counts as in the hand.
+            depth: only points at least so deep under the hand's surface count.
+            between: called between blocks of work of some milliseconds.
+        """
+        found = torch.zeros(len(poses), dtype=torch.long, device=poses.device)
+        if len(self) == 0 or len(poses) == 0:
+            return found
+        low, high = (torch.tensor(end, device=poses.device) for end in reach_of(gripper, width, distance))
+        for first in range(0, len(poses), _POSES_AT_ONCE):
+            some = poses[first : first + _POSES_AT_ONCE]
+            row, block = self._touching(some, low, high)
+            between()
+            ends = self.count[block].cumsum(0)
+            begin = 0
+            while begin < len(row):
+                done = int(ends[begin - 1]) if begin else 0
+                stop = max(begin + 1, int(torch.searchsorted(ends, done + _PAIRS_AT_ONCE, right=True)))
+                pose_of, points = self._pairs(row[begin:stop], block[begin:stop])
+                local = _in_grasp_frames(points, some[pose_of])
+                within = inside_hand(*local, gripper, width, distance, depth)
+                found.index_add_(0, first + pose_of, within.long())
+                begin = stop
+                between()
+        return found
+
+    def _touching(self, poses: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
+        """Pairs, (K,) and (K,), of poses and blocks whose sphere meets the box from `low` to `high` about the pose."""
+        rotations, origins = poses[:, :3, :3], poses[:, :3, 3]
+        local = self.centres @ rotations - (origins[:, None] @ rotations)  # (C, B, 3)
+        outside = torch.maximum(low - local, local - high).clamp_(min=0)
+        row, block = (outside.square_().sum(dim=2) <= self.radii.square()).nonzero(as_tuple=True)
+        return row, block
+
+    def _pairs(self, row: Tensor, block: Tensor) -> tuple[Tensor, Tensor]:
+        """The rows (K,) of all points (K, 3) of the blocks, row by row."""
+        count = self.count[block]
+        start = count.cumsum(0) - count
+        within = torch.arange(int(count.sum()), device=row.device) - start.repeat_interleave(count)
+        return row.repeat_interleave(count), self.points[self.first[block].repeat_interleave(count) + within]
+
+
+def _in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:
+    """x, y and z, each (K,), of each point (K, 3) in the grasp frame of its pose (K, 4, 4)."""
+    x, y, z = ((points - poses[:, :3, 3])[:, :, None] * poses[:, :3, :3]).sum(dim=1).unbind(dim=1)
+    return x, y, z

@@ -1,0 +1,65 @@
+"""The hand's volume, at rest and swept along its straight approach, as a test of places in the grasp frame.
+
+Knows no cloud. Vectorised torch; lengths in metres.
+"""
+
+from __future__ import annotations
+
+import torch
+from torch import Tensor
+
+from tesnet.geometry import Extent, Gripper, Part
+
+
+def inside_hand(
+    x: Tensor, y: Tensor, z: Tensor, gripper: Gripper, width: float, distance: float = 0.0, depth: float = 0.0
+) -> Tensor:
+    """Mask of the places that lie in the hand.
+
+    Args:
+        x: of the places in the grasp frame; `y` and `z` have its shape.
+        y: the same.
+        z: the same.
+        gripper: the hand.
+        width: opening of the fingers.
+        distance: length of the straight way, ending in the grasp, on which a place counts as in the hand.
+        depth: only places at least so deep under the surface of a part count, measured along the frame's axes.
+    """
+    x, y = x.abs(), y.abs()
+    inside = torch.zeros_like(x, dtype=torch.bool)
+    for part in gripper.parts:
+        if part.side >= 0:  # seen by |y|, one finger is both
+            inside |= _inside_part(part, x, y, z, width, distance, depth)
+    return inside
+
+
+def reach_of(gripper: Gripper, width: float, distance: float) -> tuple[list[float], list[float]]:
+    """The corners of a box in the grasp frame that holds the hand all along its way."""
+    corners = gripper.corners(width)
+    low, high = corners.min(axis=0), corners.max(axis=0)
+    return [*low[:2].tolist(), float(low[2]) - distance], high.tolist()
+
+
+def _inside_part(part: Part, x: Tensor, y: Tensor, z: Tensor, width: float, distance: float, depth: float) -> Tensor:
+    """Mask of the places (|x|, |y|, z) that a part passes.
+
+    Swept along z, a tapered part is as wide at each place as where it comes to rest. The rounding of a finger's tip is
+    left out: prepared points lie nearly as far apart as it is long.
+    """
+    inside = (
+        (z < part.front - depth)
+        & (z > part.back - distance + depth)
+        & (x < _extent(part.breadth, part.front, z, 0.5) - depth)
+    )
+    if part.side:
+        outer = _extent(part.thickness, part.front, z, 1.0) + width / 2
+        return inside & (y > width / 2 + depth) & (y < outer - depth)
+    return inside & (y < _extent(part.thickness, part.front, z, 0.5) - depth)
+
+
+def _extent(extent: Extent, front: float, z: Tensor, share: float) -> Tensor | float:
+    """A share of a part's extent at each z."""
+    if not extent.taper:
+        return share * extent.full
+    slope = share * (extent.full - extent.front) / extent.taper
+    return ((front - z) * slope + share * extent.front).clamp_(max=share * extent.full)
