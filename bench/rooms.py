@@ -1,4 +1,4 @@
-"""Depth frames of made-up rooms as a camera gives them: tables with legs and floor, chairs, shelves, bins, overhead views.
+"""Depth frames of made-up rooms: tables with legs and floor, desks, shelves, bins, overhead views; ray cast.
 
 Each frame has its intrinsics, the camera's pose and the truth about the surface that things stand on. Knows no network
 and no service; everything random derives from the seed.
@@ -70,7 +70,7 @@ class RoomFrame:
 
 
 def frames(count: int, seed: int, sizes: tuple[tuple[int, int], ...] = SIZES) -> Iterator[tuple[str, RoomFrame]]:
-    """Named frames: the kinds of `KINDS` by turns, the sizes by turns; every second one with noise of a usual camera."""
+    """Named frames: kinds and sizes by turns; every second one has the noise of a usual camera."""
     kinds = list(KINDS.items())
     for number in range(count):
         name, kind = kinds[number % len(kinds)]
@@ -222,7 +222,7 @@ def _desk(length: float, depth: float, height: float) -> list[Placed]:
 def _chair(x: float, y: float, yaw: float) -> list[Placed]:
     """A seat 0.45 m high, its back, four legs."""
     T_world_chair = standing(x, y, 0, yaw)
-    parts = [((0.2, 0.2, 0.015), (0, 0, 0.435)), ((0.2, 0.015, 0.2), (0, 0.19, 0.7))]
+    parts = [((0.2, 0.2, 0.015), (0.0, 0.0, 0.435)), ((0.2, 0.015, 0.2), (0.0, 0.19, 0.7))]
     parts += [((0.015, 0.015, 0.21), (sx * 0.18, sy * 0.18, 0.21)) for sx in (-1, 1) for sy in (-1, 1)]
     return [(Block(np.array(half)), T_world_chair @ standing(*place)) for half, place in parts]
 
