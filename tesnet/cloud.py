@@ -14,6 +14,7 @@ from torch import Tensor
 
 from tesnet.geometry import Box, Pose
 from tesnet.obstacles import Obstacles
+from tesnet.orientation import towards_who_saw
 from tesnet.points import (
     drop_points,
     estimate_normals,
@@ -73,7 +74,7 @@ class PreparedCloud:
 
     Args:
         points: (P, 3).
-        normals: (P, 3) unit, outward: turned as the query tells (`orient_normals`).
+        normals: (P, 3) unit, outward: turned as the query tells or else to the viewpoint that saw the point.
         neighbours: (P, k) indices of the nearest points, the point itself first.
         spectrum: (P, 2) the smaller two eigenvalues of the local covariance, each divided by the sum of the three.
         view_directions: (P, 3) unit, from the point to that viewpoint.
@@ -146,6 +147,8 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     on_target = None if on_target is None else on_target[keep]
     outward = None if outward is None else outward[keep]
     normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
+    if outward is None and len(viewpoints) > 1:
+        outward = towards_who_saw(points, normals, neighbours, viewpoints)
     normals, view_directions = orient_normals(points, normals, viewpoints, outward)
     support_height = None
     if query.up is not None and isinstance(query.support_height, float):

@@ -212,6 +212,26 @@ def test_normals_turn_towards_the_viewpoint_most_nearly_along_them() -> None:
     np.testing.assert_allclose(directions, expected, atol=1e-6)
 
 
+def test_a_direction_out_of_the_surface_decides_where_it_is_known() -> None:
+    rng = np.random.default_rng(0)
+    points, outward = box_surface((0.1, 0.1, 0.1), 500, rng)
+    viewpoints = rng.normal(size=(5, 3))
+    signs = rng.choice([-1.0, 1.0], (len(points), 1))
+    told = (np.arange(500) % 2 == 0)[:, None]
+    tilted = outward + rng.uniform(-0.4, 0.4, (500, 3))
+    tensors = [torch.from_numpy(array).float() for array in (points, outward * signs, viewpoints, tilted * told)]
+    normals, directions = pts.orient_normals(*tensors)
+    untold_normals, untold_directions = pts.orient_normals(*tensors[:3])
+    known = told[:, 0]
+    np.testing.assert_allclose(normals[known], outward[known], atol=1e-6)
+    torch.testing.assert_close(normals[~known], untold_normals[~known], rtol=0, atol=0)
+    torch.testing.assert_close(directions[~known], untold_directions[~known], rtol=0, atol=0)
+    to_viewpoints = viewpoints[None] - points[:, None]
+    to_viewpoints /= np.linalg.norm(to_viewpoints, axis=2, keepdims=True)
+    best = (to_viewpoints * tilted[:, None]).sum(axis=2).argmax(axis=1)
+    np.testing.assert_allclose(directions[known], to_viewpoints[np.arange(500), best][known], atol=1e-6)
+
+
 # Frames
 
 

@@ -1,0 +1,85 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+from scipy.spatial import cKDTree
+
+from tesnet import points as pts
+from tesnet.cloud import PreparedCloud
+from tesnet.geometry import Pose
+from tesnet.orientation import towards_who_saw
+from tests.tesnet.raycast import THINGS, Can, Shape, Slab, Views, around, cast
+from tests.tesnet.scenes import UP, Array, ask, prepared
+
+
+def looked_at(things: tuple[Shape, ...], cameras: Array, seed: int = 0) -> tuple[PreparedCloud, Views]:
+    views = cast(things, cameras, np.random.default_rng(seed))
+    return prepared(ask(views.points, viewpoints=views.cameras, up=UP, support_height=0.0)), views
+
+
+def cosines_with_truth(cloud: PreparedCloud, views: Views, normals: torch.Tensor) -> tuple[Array, Array]:
+    """Of the points of walls whose normal lies near its line's: cosines with the true one, and which was nearest."""
+    frame = cloud.T_cloud_canonical
+    _, nearest = cKDTree(views.points).query(frame.apply(cloud.points.double().numpy()))
+    true = views.normals[nearest]
+    cosines = (frame.rotate(normals.double().numpy()) * true).sum(axis=1)
+    counted = (np.abs(true[:, 2]) < 0.5) & (np.abs(cosines) > 0.7)
+    return cosines[counted], nearest[counted]
+
+
+@pytest.mark.parametrize("count", [2, 3, 4, 6])
+def test_walls_face_outward_when_cameras_face_each_other(count: int) -> None:
+    """Boxes, cans, a board of 3 mm and a bowl of 4 mm; the viewpoint most nearly along the normal turns half inward."""
+    cloud, views = looked_at(THINGS, around(count, start_deg=47))
+    cosines, _ = cosines_with_truth(cloud, views, cloud.normals)
+    assert (cosines < 0).mean() < 0.05
+    most_along, _ = pts.orient_normals(cloud.points, cloud.normals, cloud.viewpoints)
+    assert (cosines_with_truth(cloud, views, most_along)[0] < 0).mean() > 0.3
+
+
+@pytest.mark.parametrize("thing", [Can((0.0, 0.0, 0.0), 0.025, 0.12), Slab((0.0, 0.0, 0.0), (0.05, 0.05, 0.05))])
+def test_a_can_or_a_box_seen_all_round_faces_outward_everywhere(thing: Shape) -> None:
+    cloud, views = looked_at((thing,), around(4, polar_deg=80))
+    cosines, _ = cosines_with_truth(cloud, views, cloud.normals)
+    assert (cosines < 0).mean() < 0.005
+
+
+def test_the_direction_of_view_is_to_a_camera_on_the_outer_side_that_saw_the_point() -> None:
+    cloud, views = looked_at(THINGS[:2], around(4))
+    assert float((cloud.view_directions * cloud.normals).sum(dim=1).min()) >= -1e-6
+    to_cameras = torch.nn.functional.normalize(cloud.viewpoints[None] - cloud.points[:, None], dim=2)
+    chosen = (to_cameras * cloud.view_directions[:, None]).sum(dim=2)
+    assert float(chosen.amax(dim=1).min()) > 0.99999
+    frame = cloud.T_cloud_canonical
+    positions = frame.apply(cloud.points.double().numpy())
+    from_chosen = [cKDTree(views.points[views.view_index == camera]) for camera in range(4)]
+    distances = np.stack([tree.query(positions)[0] for tree in from_chosen])
+    nearest = distances[chosen.argmax(dim=1).numpy(), np.arange(len(positions))]
+    assert (nearest < 0.005).mean() > 0.97
+
+
+def test_the_chosen_viewpoints_do_not_depend_on_signs_and_move_with_the_cloud() -> None:
+    cloud, _ = looked_at(THINGS, around(3))
+    signs = torch.from_numpy(np.random.default_rng(0).choice([-1.0, 1.0], (len(cloud), 1))).float()
+    plain = towards_who_saw(cloud.points, cloud.normals, cloud.neighbours, cloud.viewpoints)
+    flipped = towards_who_saw(cloud.points, cloud.normals * signs, cloud.neighbours, cloud.viewpoints)
+    torch.testing.assert_close(plain, flipped)
+    motion = Pose.random(np.random.default_rng(1), reach=0.3)
+    turn, shift = torch.tensor(motion.rotation), torch.tensor(motion.translation)
+    moved = towards_who_saw(
+        (cloud.points.double() @ turn.T + shift).float(),
+        (cloud.normals.double() @ turn.T).float(),
+        cloud.neighbours,
+        (cloud.viewpoints.double() @ turn.T + shift).float(),
+    )
+    # Rounding takes single points over a pixel's border.
+    assert (((moved.double() @ turn) * plain).sum(dim=1) > 0.9999).double().mean() > 0.99
+
+
+def test_a_viewpoint_that_has_every_point_behind_it_saw_none() -> None:
+    wall = torch.tensor([[x, y, 0.0] for x in np.linspace(0, 0.1, 30) for y in np.linspace(0, 0.1, 30)]).float()
+    normals = torch.tensor([0.0, 0.0, 1.0]).expand_as(wall)
+    viewpoints = torch.tensor([[0.3, 0.0, 0.3], [0.0, 0.0, 0.6]])
+    towards = towards_who_saw(wall, normals, pts.nearest_neighbours(wall, 16), viewpoints)
+    torch.testing.assert_close(towards, torch.nn.functional.normalize(viewpoints[1] - wall, dim=1))
