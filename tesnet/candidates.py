@@ -8,6 +8,7 @@ canonical frame.
 from __future__ import annotations
 
 import math
+from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
 import torch
@@ -15,6 +16,7 @@ from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
+from tesnet.outline import Outline, outline
 from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
 
 TIP_BEYOND_CONTACT = 0.007
@@ -25,6 +27,14 @@ _STEEPEST_RISE = 0.95
 
 _FARTHEST_ASIDE = 0.005
 """Metres; contact points of shallow pairs lie no farther beside the plane in which the fingers close."""
+
+_FEW = 100
+"""With fewer candidates on a support plane those of low things are added."""
+
+_LEAST_REACH = 0.005
+"""Metres; tips that reach less far past a face slip off it."""
+
+_ROUNDING = 1e-5
 
 _NEARLY_FARTHEST = 0.7
 """Of the distance of the farthest point from those chosen: from here on a point is chosen in the same round."""
@@ -79,13 +89,20 @@ class Candidates:
         """The candidates at the indices (K,), or where the mask (C,) is true."""
         return Candidates(self.approach[which], self.contact[which], self.Ts_canonical_grasp[which])
 
+    def joined_by(self, others: Candidates) -> Candidates:
+        """These candidates, then the others of the same cloud."""
+        return Candidates(
+            torch.cat([self.approach, others.approach]),
+            torch.cat([self.contact, others.contact]),
+            torch.cat([self.Ts_canonical_grasp, others.Ts_canonical_grasp]),
+        )
+
 
 def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -> tuple[Candidates, dict[str, int]]:
     """At most `max_candidates` candidates, and how many pairs each mask dropped.
 
     Approach points lie on the target, if there is one. While they yield fewer than half of `max_candidates`, as beside
-    flat objects, four times as many are tried. Where there is no candidate in the end, as beside objects of 11 to 14 mm
-    on a support plane, those are taken that come straight down and are less deep.
+    flat objects, four times as many are tried. Those of `_without_walls` are added where they are wanted.
     """
     allowed = torch.arange(len(cloud), device=cloud.points.device)
     if cloud.on_target is not None:
@@ -102,9 +119,10 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
         if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
             break
         count = more_approach_points(count)
-    if not bool(alive.any()) and cloud.up is not None and cloud.support_height is not None:
-        candidates = _straight_down(cloud, cloud.up, query.gripper, config, approach_points)
-        alive, _ = _judge(cloud, query, config, candidates)
+    for others in _without_walls(cloud, query, config, approach_points, int(alive.sum())):
+        also_alive, also_rejected = _judge(cloud, query, config, others)
+        candidates, alive = candidates.joined_by(others), torch.cat([alive, also_alive])
+        rejected = {name: count + also_rejected[name] for name, count in rejected.items()}
     survivors = alive.nonzero()[:, 0]
     if len(survivors) > query.max_candidates:
         chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values
@@ -164,36 +182,73 @@ def _judge(
     return alive, rejected
 
 
-def _straight_down(
-    cloud: PreparedCloud, up: Tensor, hand: Gripper, config: CandidateConfig, approach_points: Tensor
-) -> Candidates:
-    """Pairs less deep than `min_depth`, for a hand that travels against `up` and closes along the levelled normal.
+def _without_walls(
+    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, approach_points: Tensor, count: int
+) -> Iterator[Candidates]:
+    """The candidates that do without a wall to measure depth on, beside `count` of those that have one.
+
+    On the outline of faces seen from straight above the outward direction of the edge stands for the contact normal.
+    Without `up` such faces cannot be told from others, and low things only stand on a known plane: there, these
+    candidates are for want of others.
+    """
+    if cloud.up is not None or count == 0:
+        edges = outline(cloud, query)
+        if len(edges.points):
+            depths = (config.min_offset, config.max_depth)
+            yield _along_travel(cloud, query.gripper, config, approach_points, edges, depths)
+    if cloud.up is not None and cloud.support_height is not None and count < _FEW:
+        walls = _low_walls(cloud, cloud.up)
+        yield _along_travel(cloud, query.gripper, config, approach_points, walls, (0.0, config.min_depth))
+
+
+def _low_walls(cloud: PreparedCloud, up: Tensor) -> Outline:
+    """Contact points of pairs less deep than `min_depth`, for a hand that closes along the levelled normal.
 
     So shallow a pair says nothing of the direction of travel, but of flat things that lie on a plane it is known.
     """
     rise = cloud.normals @ up
     level = torch.nn.functional.normalize(cloud.normals - rise[:, None] * up, dim=1)
     contacts = (rise.abs() < _STEEPEST_RISE).nonzero()[:, 0]
+    return Outline(contacts, level[contacts], (-up).expand(len(contacts), 3))
+
+
+def _along_travel(
+    cloud: PreparedCloud,
+    hand: Gripper,
+    config: CandidateConfig,
+    approach_points: Tensor,
+    edges: Outline,
+    depths: tuple[float, float],
+) -> Candidates:
+    """Pairs of approach points with edges whose directions of closing and travel are known.
+
+    Depth, along the travel, lies from the first of `depths` to below the second. A hand that would come too near to the
+    support stops short of it, if its tips still reach `_LEAST_REACH` past the approach point.
+    """
     found = []
-    for some in approach_points.split(max(1, _PAIRS_AT_ONCE // max(1, len(contacts)))):
-        offsets = cloud.points[contacts][None] - cloud.points[some][:, None]
-        along = (offsets * level[contacts][None]).sum(dim=2)
-        depth = -(offsets @ up)
+    for some in approach_points.split(max(1, _PAIRS_AT_ONCE // max(1, len(edges.points)))):
+        offsets = cloud.points[edges.points][None] - cloud.points[some][:, None]
+        along = (offsets * edges.outward[None]).sum(dim=2)
+        depth = (offsets * edges.travel[None]).sum(dim=2)
         square = offsets.square().sum(dim=2)
         aside = (square - along.square() - depth.square()).clamp(min=0).sqrt()
         ok = (
             (square <= config.max_pair_distance**2)
-            & (depth >= 0)
-            & (depth < config.min_depth)
+            & (depth >= depths[0])
+            & (depth < depths[1])
             & (along >= config.min_offset)
             & (along <= config.max_offset)
             & (aside <= _FARTHEST_ASIDE)
         )
-        which, contact = ok.nonzero(as_tuple=True)
-        found.append((some[which], contacts[contact]))
-    approach, contact = (torch.cat(parts) for parts in zip(*found, strict=True))
-    down = (-up).expand(len(approach), 3)
-    poses = poses_along(cloud.points[approach], cloud.points[contact], level[contact], down, hand=hand)
+        which, edge = ok.nonzero(as_tuple=True)
+        found.append((some[which], edge))
+    approach, edge = (torch.cat(parts) for parts in zip(*found, strict=True))
+    contact, closing, travel = edges.points[edge], edges.outward[edge], edges.travel[edge]
+    poses = poses_along(cloud.points[approach], cloud.points[contact], closing, travel, hand=hand)
+    too_low = config.support_clearance + _ROUNDING - hand_clearance(cloud, poses, hand)
+    reach = ((poses[:, :3, 3] - cloud.points[approach]) * travel).sum(dim=1) + hand.tip_offset
+    lift = torch.where(reach - too_low >= _LEAST_REACH, too_low.clamp(min=0), 0.0)
+    poses[:, :3, 3] -= lift[:, None] * travel
     return Candidates(approach, contact, poses)
 
 

@@ -4,12 +4,13 @@ from __future__ import annotations
 
 from collections.abc import Sequence
 from dataclasses import dataclass
-from typing import Protocol
+from typing import Any, Protocol
 
 import numpy as np
 
 from tesnet.geometry import Pose
-from tests.tesnet.scenes import UP, Array
+from tesnet.query import GraspQuery
+from tests.tesnet.scenes import UP, Array, ask
 
 WIDTH, HEIGHT, FOCAL = 240, 180, 220.0
 """Pixels. At 0.6 m one is 2.7 mm wide."""
@@ -115,6 +116,17 @@ THINGS: tuple[Shape, ...] = (
     Bowl((0.01, 0.12, 0.0), 0.05, 0.004),
 )
 """Boxes, a board of 3 mm on its edge, cans and a bowl of 4 mm, on the plane z = 0."""
+
+
+TABLE = Slab((0.0, 0.0, -0.02), (2.0, 2.0, 0.02))
+OVERHEAD = np.array([[0.001, 0.0, 0.6]])
+"""Straight above, all but: a camera that looks along the vertical has no upright image."""
+
+
+def overhead_query(things: Sequence[Shape], camera: Array = OVERHEAD, **options: Any) -> GraspQuery:
+    """What a camera sees of things on a table, and of the table."""
+    views = cast((TABLE, *things), camera, np.random.default_rng(0), noise=0.0003)
+    return ask(views.points, **{"viewpoints": views.cameras, "up": UP, "support_height": 0.0, **options})
 
 
 def around(count: int, polar_deg: float = 60.0, radius: float = 0.6, start_deg: float = 10.0) -> Array:

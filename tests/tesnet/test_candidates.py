@@ -11,10 +11,12 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tesnet import candidates, cloud
+from tesnet import candidates, cloud, collision
 from tesnet.candidates import CandidateConfig, Candidates
 from tesnet.geometry import PANDA
+from tesnet.outline import Outline, outline
 from tesnet.query import ApproachCone
+from tests.tesnet.raycast import Bowl, Slab, overhead_query
 from tests.tesnet.scenes import (
     CAMERA,
     UP,
@@ -284,24 +286,84 @@ def test_hands_close_level_on_walls_that_are_nearly_upright_and_only_there() -> 
     assert candidates.contact_normals(replace(cloud_, up=None), CONFIG) is cloud_.normals
 
 
-@pytest.mark.parametrize("height", [0.0125, 0.0135])
-def test_hands_come_straight_down_on_things_too_low_for_any_other_candidate(height: float) -> None:
+@pytest.mark.parametrize("height", [0.0105, 0.0125, 0.0135, 0.015])
+def test_hands_come_straight_down_on_low_things(height: float) -> None:
     points, normals = box_surface((0.05, 0.07, height), 60_000, np.random.default_rng(0))
     seen = seen_from(points + height / 2 * UP, normals, CAMERA)
     query = ask(seen, viewpoints=CAMERA, up=UP, support_height=0.0)
     flat = prepared(query)
     found, rejected = candidates.generate(flat, query, CONFIG)
-    assert len(found) > 0
     assert rejected["support"] > 0
     assert flat.up is not None
+    assert flat.support_height is not None
     up = exact(flat.up)
-    rotations = exact(found.Ts_canonical_grasp[:, :3, :3])
-    np.testing.assert_allclose(rotations[:, :, 2] @ up, -1, atol=1e-5)
+    straight = exact(found.Ts_canonical_grasp[:, :3, 2]) @ up < -0.9999
+    assert straight.sum() > 100
+    assert (~straight).sum() < 100  # pairs that are deep enough come first
+    low = found.select(torch.from_numpy(straight))
+    rotations = exact(low.Ts_canonical_grasp[:, :3, :3])
     np.testing.assert_allclose(rotations[:, :, 1] @ up, 0, atol=1e-5)
     np.testing.assert_allclose(np.linalg.det(rotations), 1, atol=1e-5)
-    assert (lowest_corner(flat, found) >= CONFIG.support_clearance - 1e-6).all()
-    pairs = exact(flat.points[found.contact] - flat.points[found.approach])
-    depth = -(pairs @ up)
-    assert ((depth >= 0) & (depth < CONFIG.min_depth)).all()
-    tips = exact(found.Ts_canonical_grasp[:, :3, 3]) @ up - PANDA.tip_offset
-    np.testing.assert_allclose(tips, exact(flat.points[found.approach]) @ up - depth - 0.007, atol=1e-6)
+    approach = exact(flat.points[low.approach]) @ up - flat.support_height
+    depth = approach - (exact(flat.points[low.contact]) @ up - flat.support_height)
+    assert (depth >= -1e-7).all()
+    tips = exact(low.Ts_canonical_grasp[:, :3, 3]) @ up - flat.support_height - PANDA.tip_offset
+    lowest = np.maximum(approach - depth - 0.007, CONFIG.support_clearance)
+    np.testing.assert_allclose(tips, lowest, atol=2e-5)
+    assert (lowest_corner(flat, low) >= CONFIG.support_clearance - 1e-6).all()
+    assert (approach - tips >= 0.005 - 2e-5).all()
+
+
+def test_a_thing_too_low_for_the_tips_has_no_candidates() -> None:
+    points, normals = box_surface((0.05, 0.07, 0.0085), 60_000, np.random.default_rng(0))
+    seen = seen_from(points + 0.00425 * UP, normals, CAMERA)
+    query = ask(seen, viewpoints=CAMERA, up=UP, support_height=0.0)
+    found, _ = candidates.generate(prepared(query), query, CONFIG)
+    assert len(found) == 0
+
+
+@pytest.mark.parametrize("height", [0.011, 0.04, 0.12])
+def test_hands_come_straight_down_over_the_edges_of_a_face_seen_from_above(height: float) -> None:
+    query = overhead_query((Slab((0.0, 0.0, 0.0), (0.06, 0.04, height)),), max_candidates=20_000)
+    cloud = prepared(query)
+    found, rejected = candidates.generate(cloud, query, CONFIG)
+    assert set(rejected) == {"from_below", "approach", "support", "target"}
+    frame = cloud.T_cloud_canonical
+    # Over a high face there are pairs for hands that come from the side, too: one finger above, one beneath.
+    found = found.select(found.Ts_canonical_grasp[:, 2, 2] < -0.9999)
+    assert len(found) > 100
+    rotations = frame.rotation @ exact(found.Ts_canonical_grasp[:, :3, :3])
+    np.testing.assert_allclose(rotations[:, :, 2], np.tile(-UP, (len(found), 1)), atol=1e-5)
+    contact, approach = (frame.apply(exact(cloud.points[index])) for index in (found.contact, found.approach))
+    assert ((np.array([0.03, 0.02]) - np.abs(contact[:, :2])).min(axis=1) < 0.006).all()
+    outward = (rotations[:, :, 1] * (contact - approach)).sum(axis=1)
+    assert (outward >= CONFIG.min_offset - 1e-6).all()
+    tips = frame.apply(exact(found.Ts_canonical_grasp[:, :3, 3]))[:, 2] - PANDA.tip_offset
+    np.testing.assert_allclose(tips, np.maximum(contact[:, 2] - 0.007, CONFIG.support_clearance), atol=2e-5)
+    free = ~collision.blocked(cloud, found.Ts_canonical_grasp, query.gripper, "free")
+    assert int(free.sum()) > 20
+
+
+def test_the_outline_joins_the_pairs_where_both_are(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Of a bowl an overhead camera sees the inner wall, of the box beside it none."""
+    query = overhead_query(
+        (Slab((-0.05, 0.0, 0.0), (0.05, 0.04, 0.06)), Bowl((0.06, 0.0, 0.0), 0.035, 0.004)), max_candidates=20_000
+    )
+    cloud = prepared(query)
+    both, rejected = candidates.generate(cloud, query, CONFIG)
+    edges = outline(cloud, query)
+    none = Outline(edges.points[:0], edges.outward[:0], edges.travel[:0])
+    monkeypatch.setattr(candidates, "outline", lambda *_: none)
+    pairs, pairs_rejected = candidates.generate(cloud, query, CONFIG)
+    assert 100 < len(pairs) < len(both) - 100
+    assert torch.equal(both.Ts_canonical_grasp[: len(pairs)], pairs.Ts_canonical_grasp)
+    assert set(both.contact[len(pairs) :].tolist()) <= set(edges.points.tolist())
+    assert all(rejected[name] >= count for name, count in pairs_rejected.items())
+
+
+def test_what_is_rejected_of_the_outline_is_counted() -> None:
+    query = overhead_query((Slab((0.0, 0.0, 0.0), (0.06, 0.04, 0.05)),))
+    sideways = replace(query, approach=ApproachCone(np.array([1.0, 0.0, 0.0]), 30.0))
+    found, rejected = candidates.generate(prepared(query), sideways, CONFIG)
+    assert len(found) == 0
+    assert rejected["approach"] > 100
