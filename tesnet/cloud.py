@@ -14,13 +14,12 @@ from torch import Tensor
 
 from tesnet.geometry import Box, Pose
 from tesnet.obstacles import Obstacles
-from tesnet.orientation import towards_who_saw
+from tesnet.orientation import orient
 from tesnet.points import (
     drop_points,
     estimate_normals,
     members_of_cells,
     nearest_neighbours,
-    orient_normals,
     statistical_outliers,
     voxel_downsample,
 )
@@ -147,16 +146,15 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     on_target = None if on_target is None else on_target[keep]
     outward = None if outward is None else outward[keep]
     normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
-    if outward is None and len(viewpoints) > 1:
-        outward = towards_who_saw(points, normals, neighbours, viewpoints)
-    normals, view_directions = orient_normals(points, normals, viewpoints, outward)
+    graph = neighbours[:, : config.graph_neighbours]
+    normals, view_directions = orient(points, normals, graph, viewpoints, outward)
     support_height = None
     if query.up is not None and isinstance(query.support_height, float):
         support_height = float(query.support_height - T_cloud_canonical.translation @ query.up)
     return PreparedCloud(
         points=points,
         normals=normals,
-        neighbours=neighbours[:, : config.graph_neighbours],
+        neighbours=graph,
         spectrum=spectrum,
         view_directions=view_directions,
         viewpoints=viewpoints,

@@ -8,6 +8,7 @@ from __future__ import annotations
 import torch
 from torch import Tensor
 
+from tesnet.points import LEAST_OUTWARD, orient_normals
 from tesnet.ranges import range_image
 
 _PIXEL = 0.009
@@ -15,6 +16,26 @@ _PIXEL = 0.009
 
 _IN_FRONT = 0.0015
 """A point hides another when it lies this far out of that one's surface, metres: walls may be as thin as twice this."""
+
+
+def orient(
+    points: Tensor, normals: Tensor, neighbours: Tensor, viewpoints: Tensor, outward: Tensor | None = None
+) -> tuple[Tensor, Tensor]:
+    """Normals (P, 3) turned outward, and unit directions (P, 3) to the viewpoint that saw each point.
+
+    Args:
+        points: (P, 3).
+        normals: (P, 3) unit, of either sign.
+        neighbours: (P, k) of each point, itself the first.
+        viewpoints: (V, 3).
+        outward: (P, 3) directions out of the surface where they are known, zeros elsewhere: given normals, or
+            directions to the viewpoint that is known to have seen a point. There they decide.
+    """
+    if len(viewpoints) > 1:
+        seen_by = towards_who_saw(points, normals, neighbours, viewpoints)
+        told = torch.zeros_like(points) if outward is None else outward
+        outward = torch.where(told.norm(dim=1, keepdim=True) > LEAST_OUTWARD, told, seen_by)
+    return orient_normals(points, normals, viewpoints, outward)
 
 
 def towards_who_saw(points: Tensor, normals: Tensor, neighbours: Tensor, viewpoints: Tensor) -> Tensor:

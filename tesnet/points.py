@@ -149,7 +149,7 @@ def estimate_normals(points: Tensor, neighbours: Tensor, radius: float) -> tuple
     return normals.to(points.dtype), spectrum.to(points.dtype)
 
 
-_LEAST_OUTWARD = 0.1
+LEAST_OUTWARD = 0.1
 """Length of the mean of unit vectors that say nothing together."""
 
 
@@ -169,7 +169,7 @@ def orient_normals(
     rows = torch.arange(len(points), device=points.device)
     along = alignment[rows, best]
     if outward is not None:
-        told = outward.norm(dim=1) > _LEAST_OUTWARD
+        told = outward.norm(dim=1) > LEAST_OUTWARD
         best = torch.where(told, (directions * outward[:, None]).sum(dim=2).argmax(dim=1), best)
         along = torch.where(told, (normals * outward).sum(dim=1), along)
     sign = torch.where(along < 0, -1.0, 1.0)

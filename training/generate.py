@@ -269,7 +269,7 @@ def _label_view(
         kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), hand.gripper.max_width), snapshot)
     return LabelledView(
         cloud=prepared,
-        pairs=pairs_of(prepared, picked),
+        pairs=pairs_of(prepared, picked, hand.gripper),
         approach=picked.approach,
         contact=picked.contact,
         outcomes=torch.tensor([OUTCOME_KINDS.index(kind) for kind in kinds], dtype=torch.uint8),

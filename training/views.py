@@ -16,12 +16,14 @@ from numpy.typing import NDArray
 from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
 from tesnet.cloud import PreparationConfig, PreparedCloud
-from tesnet.geometry import Pose
+from tesnet.geometry import Gripper, Pose
 from tesnet.hands import HANDS
-from tesnet.points import orient_normals
+from tesnet.orientation import orient
 from tesnet.whole_file import whole_file
 
 _TODAY = PreparationConfig()
+_ROUNDING = 1e-5
+"""Metres."""
 
 
 class LabelsError(Exception):
@@ -119,10 +121,17 @@ def save_scene(
         np.savez(file, allow_pickle=False, **arrays)
 
 
-def pairs_of(cloud: PreparedCloud, candidates: Candidates) -> torch.Tensor:
-    """(C, 4, 3) approach points, contact points and directions of closing and travel of a cloud's own candidates."""
+def pairs_of(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> torch.Tensor:
+    """(C, 4, 3) approach points, contact points and directions of closing and travel of a hand's candidates on a cloud.
+
+    Where the hand stops short of its usual depth past the contact point, this stands as much less deep.
+    """
     _, closing, travel = candidates.Ts_canonical_grasp[:, :3, :3].unbind(dim=2)
-    return torch.stack([cloud.points[candidates.approach], cloud.points[candidates.contact], closing, travel], dim=1)
+    approach, contact = cloud.points[candidates.approach], cloud.points[candidates.contact]
+    usual = poses_along(approach, contact, closing, travel, hand=hand)
+    short = ((usual - candidates.Ts_canonical_grasp)[:, :3, 3] * travel).sum(dim=1, keepdim=True)
+    contact = torch.where(short > _ROUNDING, contact - short * travel, contact)
+    return torch.stack([approach, contact, closing, travel], dim=1)
 
 
 def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
@@ -154,11 +163,12 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     points = tensor("points", torch.float32)
     viewpoints = torch.tensor(frame["viewpoints"])
     normals = torch.nn.functional.normalize(tensor("normals", torch.float32), dim=1)
-    normals, view_directions = orient_normals(points, normals, viewpoints)
+    neighbours = tensor("neighbours", torch.long)
+    normals, view_directions = orient(points, normals, neighbours, viewpoints)
     cloud = PreparedCloud(
         points=points,
         normals=normals,
-        neighbours=tensor("neighbours", torch.long),
+        neighbours=neighbours,
         spectrum=tensor("spectrum", torch.float32),
         view_directions=view_directions,
         viewpoints=viewpoints,

@@ -8,7 +8,7 @@ from scipy.spatial import cKDTree
 from tesnet import points as pts
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Pose
-from tesnet.orientation import towards_who_saw
+from tesnet.orientation import orient, towards_who_saw
 from tests.tesnet.raycast import THINGS, Can, Shape, Slab, Views, around, cast
 from tests.tesnet.scenes import UP, Array, ask, prepared
 
@@ -83,3 +83,32 @@ def test_a_viewpoint_that_has_every_point_behind_it_saw_none() -> None:
     viewpoints = torch.tensor([[0.3, 0.0, 0.3], [0.0, 0.0, 0.6]])
     towards = towards_who_saw(wall, normals, pts.nearest_neighbours(wall, 16), viewpoints)
     torch.testing.assert_close(towards, torch.nn.functional.normalize(viewpoints[1] - wall, dim=1))
+
+
+@pytest.mark.parametrize("count", [1, 3])
+def test_directions_that_are_told_decide_over_what_is_seen(count: int) -> None:
+    cloud, _ = looked_at(THINGS, around(count))
+    inside_out = -cloud.normals
+    told = torch.arange(len(cloud)) % 2 == 0
+    normals, _ = orient(
+        cloud.points, cloud.normals, cloud.neighbours, cloud.viewpoints, torch.where(told[:, None], inside_out, 0.0)
+    )
+    seen, _ = orient(cloud.points, cloud.normals, cloud.neighbours, cloud.viewpoints)
+    torch.testing.assert_close(normals[told], inside_out[told], rtol=0, atol=0)
+    torch.testing.assert_close(normals[~told], seen[~told], rtol=0, atol=0)
+    torch.testing.assert_close(seen, cloud.normals, rtol=0, atol=0)
+
+
+def test_who_saw_a_point_as_told_turns_even_the_walls_of_a_board_of_2_mm() -> None:
+    board = Slab((0.0, 0.0, 0.0), (0.10, 0.002, 0.08))
+    cameras = around(2, start_deg=90, polar_deg=70)
+    cloud, views = looked_at((board,), cameras)
+    positions = cloud.T_cloud_canonical.apply(cloud.points.double().numpy())
+    _, nearest = cKDTree(views.points).query(positions)
+    towards = cameras[views.view_index[nearest]] - positions
+    outward = torch.from_numpy(cloud.T_cloud_canonical.inverse().rotate(towards)).float()
+    outward = torch.nn.functional.normalize(outward, dim=1)
+    normals, directions = orient(cloud.points, cloud.normals, cloud.neighbours, cloud.viewpoints, outward)
+    cosines, _ = cosines_with_truth(cloud, views, normals)
+    assert (cosines > 0).all()
+    assert float((directions * outward).sum(dim=1).min()) > 0.9999

@@ -8,6 +8,7 @@ import torch
 
 from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet import candidates
+from tesnet.geometry import PANDA
 from tests.tesnet.scenes import WORKSPACE, prepared, tabletop_query
 from training.views import LabelledView, pairs_of, save_scene
 
@@ -30,7 +31,7 @@ def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) 
     outcomes[successes] = OUTCOME_KINDS.index("success")
     return LabelledView(
         cloud=ready,
-        pairs=pairs_of(ready, found),
+        pairs=pairs_of(ready, found, PANDA),
         approach=found.approach,
         contact=found.contact,
         outcomes=outcomes,

@@ -7,9 +7,12 @@ import numpy as np
 import pytest
 import torch
 
+from tesnet.candidates import CandidateConfig, generate, poses_along
 from tesnet.cloud import PreparationConfig
+from tesnet.geometry import PANDA
+from tests.tesnet.scenes import CAMERA, UP, ask, box_surface, prepared, seen_from, tabletop_query
 from tests.training.synthetic import labelled_view, write
-from training.views import LabelsError, load_scene, load_views, save_scene, scene_files
+from training.views import LabelsError, load_scene, load_views, pairs_of, save_scene, scene_files
 
 
 def test_labels_round_trip(tmp_path: Path) -> None:
@@ -45,6 +48,20 @@ def test_labels_round_trip(tmp_path: Path) -> None:
         assert len(after.cloud.sides) == 4
         assert torch.equal(after.cloud.sides, before.cloud.sides)
         np.testing.assert_array_equal(after.cloud.T_cloud_canonical.matrix, before.cloud.T_cloud_canonical.matrix)
+
+
+def test_pairs_of_hands_that_stop_short_give_their_poses_again() -> None:
+    points, normals = box_surface((0.05, 0.07, 0.0105), 60_000, np.random.default_rng(0))
+    seen = seen_from(points + 0.00525 * UP, normals, CAMERA)
+    low = ask(seen, viewpoints=CAMERA, up=UP, support_height=0.0)
+    for query, stops_short in ((low, True), (tabletop_query(), False)):
+        cloud = prepared(query)
+        found, _ = generate(cloud, query, CandidateConfig())
+        pairs = pairs_of(cloud, found, PANDA)
+        again = poses_along(*pairs.unbind(dim=1))
+        torch.testing.assert_close(again, found.Ts_canonical_grasp, atol=1.1e-5, rtol=0)
+        moved = (pairs[:, 1] - cloud.points[found.contact]).norm(dim=1)
+        assert (float(moved.max()) > 0.001) == stops_short
 
 
 def test_poses_of_shallow_pairs_round_trip(tmp_path: Path) -> None:
