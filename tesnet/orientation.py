@@ -64,7 +64,8 @@ def towards_who_saw(points: Tensor, normals: Tensor, neighbours: Tensor, viewpoi
     sign = torch.where(torch.where(side == 0, strongest, side) < 0, -1.0, 1.0)
     facing = along * sign[:, None]
     best = torch.where(clear & (facing > 0), facing + 2, facing).argmax(dim=1)
-    return directions[torch.arange(len(points), device=points.device), best]
+    chosen: Tensor = directions[torch.arange(len(points), device=points.device), best]
+    return chosen
 
 
 def _is_clear(points: Tensor, normals: Tensor, viewpoint: Tensor) -> Tensor:
