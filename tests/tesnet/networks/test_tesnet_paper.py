@@ -4,7 +4,6 @@ import numpy as np
 import torch
 
 from tesnet import networks
-from tesnet.layers import GATv2Conv, SAGEConv
 from tesnet.networks.balls import balls, nearest_in_ball
 from tesnet.networks.tesnet_paper import TesNetPaper, centred_directions
 from tests.tesnet.scenes import prepared, tabletop_query
@@ -52,16 +51,3 @@ def test_the_two_variants_differ_in_their_graph_alone() -> None:
         first, second = (network.point_features(points, normals) for network in (paper, euclidean))
     assert first.shape == (4, 100, 160)
     assert (first - second).abs().mean() > 1e-3
-
-
-def test_gatv2_has_attention_where_the_paper_has_sage_and_nothing_else_differs() -> None:
-    paper, gatv2 = networks.build("tesnet-paper"), networks.build("gatv2")
-    assert isinstance(paper, TesNetPaper)
-    assert isinstance(gatv2, TesNetPaper)
-    assert all(isinstance(stage.aggregate, SAGEConv) for stage in paper.stages)
-    assert all(isinstance(stage.aggregate, GATv2Conv) and stage.aggregate.heads == 4 for stage in gatv2.stages)
-    shapes = [
-        {key: value.shape for key, value in network.state_dict().items() if ".aggregate." not in key}
-        for network in (paper, gatv2)
-    ]
-    assert shapes[0] == shapes[1]
