@@ -45,7 +45,9 @@ def main(arguments: Sequence[str] | None = None) -> int:
             "--mask, --target-label, --camera-pose, --depth-scale and --stride belong to a depth image; give its "
             "--intrinsics as well"
         )
-    if chosen.support_height is not None and chosen.up is None:
+    if chosen.up is not None and chosen.up != ["auto"] and (len(chosen.up) != 3 or "auto" in chosen.up):
+        parser.error("--up takes X Y Z, or auto")
+    if chosen.support_height is not None and chosen.up is None and chosen.intrinsics is None:
         parser.error("--support-height is measured along `up`; give --up as well, for instance --up 0 0 1")
     try:
         with GraspClient(chosen.url, timeout=chosen.timeout, api_key=os.environ.get(API_KEY_VARIABLE)) as client:
@@ -138,6 +140,8 @@ def _options(chosen: argparse.Namespace) -> GraspOptions:
         options["target"] = {"label": chosen.target_label}
     if chosen.gripper is not None:
         options["gripper"] = _gripper(chosen.gripper)
+    if chosen.up is not None:
+        options["up"] = "auto" if chosen.up == ["auto"] else chosen.up
     for name in _PLAIN_OPTIONS:
         value = getattr(chosen, name)
         if value is not None:
@@ -146,7 +150,6 @@ def _options(chosen: argparse.Namespace) -> GraspOptions:
 
 
 _PLAIN_OPTIONS = (
-    "up",
     "support_height",
     "max_grasps",
     "min_score",
@@ -168,7 +171,7 @@ def _number(text: str) -> float:
     return value
 
 
-def _height(text: str) -> float | str:
+def _number_or_auto(text: str) -> float | str:
     return text if text == "auto" else _number(text)
 
 
@@ -234,9 +237,18 @@ def _parser() -> argparse.ArgumentParser:
         action="append",
         help="camera position; repeat it for a fused cloud",
     )
-    add("--up", type=_number, nargs=3, metavar=vector, help="direction against gravity")
     add(
-        "--support-height", type=_height, metavar="H", help="height of the support plane along --up, or auto to find it"
+        "--up",
+        type=_number_or_auto,
+        nargs="+",
+        metavar="X",
+        help="direction against gravity, X Y Z, or auto to find it",
+    )
+    add(
+        "--support-height",
+        type=_number_or_auto,
+        metavar="H",
+        help="height of the support plane along --up, or auto to find it",
     )
     add(
         "--target-box",

@@ -121,7 +121,9 @@ class GraspOptions(TypedDict, total=False):
     Args:
         viewpoint: camera position, or a list of positions for a fused cloud; orients normals. Default: the origin, and
             a warning says so.
-        up: direction against gravity. Without it grasps from below are not filtered, and a warning says so.
+        up: direction against gravity, or `"auto"`: that of the plane that things stand on, found with its height; a
+            warning then says where. Default: auto for a depth image; for points none, so that grasps from below are not
+            filtered, and a warning says so.
         workspace: `{"min": ..., "max": ...}`; points outside are ignored.
         support_height: height of the support plane along `up` (needs `up`), or `"auto"` to find it: a warning then says
             where.
@@ -142,7 +144,7 @@ class GraspOptions(TypedDict, total=False):
     """
 
     viewpoint: Vector | Sequence[Vector]
-    up: Vector
+    up: Vector | Literal["auto"]
     workspace: Box
     support_height: float | Literal["auto"]
     target: TargetBox | TargetPoints | TargetLabel

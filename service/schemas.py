@@ -150,10 +150,12 @@ class GraspOptions(RequestPart):
         "fused cloud; turns normals towards the camera. Default: the camera of a depth image; of a cloud the origin, "
         "and `warnings` says so.",
     )
-    up: Vector | None = Field(
+    up: Vector | Literal["auto"] | None = Field(
         default=None,
-        description="Direction [x, y, z] against gravity in the cloud frame, of any length. Default: none, so grasps "
-        "from below are not filtered, only those from behind what the camera sees, and `warnings` says so.",
+        description="Direction [x, y, z] against gravity in the cloud frame, of any length. `auto` finds the plane that "
+        "things stand on, of several the one nearest the camera: its normal is up, its height the `support_height`, and "
+        "`warnings` gives the figures. Default: `auto` for a depth image; for a cloud none, so grasps from below are "
+        "not filtered, only those from behind what the camera sees, and `warnings` says so.",
     )
     workspace: Box | None = Field(
         default=None,
@@ -163,8 +165,8 @@ class GraspOptions(RequestPart):
     support_height: float | Literal["auto"] | None = Field(
         default=None,
         description="Height of the support plane along `up` in metres (needs `up`): points lower than 5 mm above it "
-        "are dropped, and the hand stays 4 mm clear of it. `auto` finds the dominant plane across `up`, and `warnings` "
-        "says where. Default: none.",
+        "are dropped, and the hand stays 4 mm clear of it. `auto` finds the plane that things stand on, and "
+        "`warnings` says where; where no `target` is given, grasps are looked for on those things, up to 0.35 m above it. Default: none.",
     )
     target: Target | None = Field(
         default=None,

@@ -124,7 +124,7 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     points = table[:, :3]
 
     viewpoints = torch.zeros(1, 3) if query.viewpoints is None else torch.tensor(query.viewpoints)
-    up = None if query.up is None else torch.tensor(query.up)
+    up = None if query.known_up is None else torch.tensor(query.known_up)
     T_cloud_canonical = canonical_frame(points, viewpoints.to(device), None if up is None else up.to(device))
 
     def to_canonical(positions: Tensor) -> Tensor:
@@ -149,8 +149,8 @@ def prepare(query: GraspQuery, config: PreparationConfig, device: torch.device) 
     graph = neighbours[:, : config.graph_neighbours]
     normals, view_directions = orient(points, normals, graph, viewpoints, outward)
     support_height = None
-    if query.up is not None and isinstance(query.support_height, float):
-        support_height = float(query.support_height - T_cloud_canonical.translation @ query.up)
+    if query.known_up is not None and isinstance(query.support_height, float):
+        support_height = float(query.support_height - T_cloud_canonical.translation @ query.known_up)
     return PreparedCloud(
         points=points,
         normals=normals,
@@ -198,9 +198,9 @@ def crop(points: Tensor, query: GraspQuery) -> Tensor:
 
 def above_support(points: Tensor, query: GraspQuery) -> Tensor:
     """Rows (N, 3 or more), beginning with x, y, z, that do not belong to the query's support plane or lie below it."""
-    if query.up is None or not isinstance(query.support_height, float):
+    if query.known_up is None or not isinstance(query.support_height, float):
         return points
-    heights = points[:, :3] @ torch.tensor(query.up, dtype=points.dtype, device=points.device)
+    heights = points[:, :3] @ torch.tensor(query.known_up, dtype=points.dtype, device=points.device)
     return points[heights >= query.support_height + SUPPORT_NOISE]
 
 
@@ -304,8 +304,8 @@ def _on_target(query: GraspQuery, table: Tensor, T_cloud_canonical: Pose) -> Ten
 def _sides(query: GraspQuery, T_cloud_canonical: Pose) -> Tensor:
     """`PreparedCloud.sides` of a query."""
     planes = []
-    if query.workspace is not None and query.up is not None:
-        for axis in np.flatnonzero(np.abs(query.up) <= _UPRIGHT):
+    if query.workspace is not None and query.known_up is not None:
+        for axis in np.flatnonzero(np.abs(query.known_up) <= _UPRIGHT):
             for sign, end in ((-1.0, query.workspace.minimum[axis]), (1.0, query.workspace.maximum[axis])):
                 normal = sign * np.eye(3)[axis]
                 offset = sign * end - normal @ T_cloud_canonical.translation

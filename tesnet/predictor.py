@@ -174,12 +174,8 @@ class GraspPredictor:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""
         clock = _Clock(give_up)
         rejected = dict.fromkeys(REJECTIONS, 0)
-        notes = _query_warnings(query)
-        found_support = query.support_height == "auto"
-        if found_support:
-            query, note = support.settled(query, self.device)
-            notes.append(note)
-        notes += _support_warnings(query)
+        query, plane, found = support.settled(query)
+        notes = [*_query_warnings(query), *found, *_support_warnings(query)]
 
         clock.check()
         prepared = cloud.prepare(query, self._preparation, self.device)
@@ -189,7 +185,7 @@ class GraspPredictor:
             notes += _cloud_warnings(prepared, query, self._preparation)
         if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
             count = 0 if prepared is None else len(prepared)
-            outside = prepared is None and len(query.points) > 0 and not (found_support and query.workspace is None)
+            outside = prepared is None and len(query.points) > 0 and (plane is None or query.workspace is not None)
             reason: Reason = "no_points_in_workspace" if outside else "too_few_points"
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
         notes += _target_warnings(prepared, query, self._preparation)
@@ -428,9 +424,10 @@ def _target_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: c
 
 
 def _support_warnings(query: GraspQuery) -> list[str]:
-    if query.up is None or query.viewpoints is None or not isinstance(query.support_height, float):
+    up = query.known_up
+    if up is None or query.viewpoints is None or not isinstance(query.support_height, float):
         return []
-    note = plausibility.reversed_up(query.viewpoints @ query.up, query.support_height)
+    note = plausibility.reversed_up(query.viewpoints @ up, query.support_height)
     return [] if note is None else [note]
 
 

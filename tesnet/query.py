@@ -46,9 +46,10 @@ class GraspQuery:
     Args:
         points: (N, 3) metres; stored as float32.
         viewpoints: (3,) or (V, 3) camera positions in the cloud frame; None is the origin.
-        up: (3,) direction against gravity, made unit length.
+        up: (3,) direction against gravity, made unit length, or `auto`: that of the plane that things stand on, whose
+            height is found as well.
         workspace: points outside are ignored; with `up`, scores allow for what may stand beyond its upright sides.
-        support_height: height of the support plane along `up`, metres, or `auto` to find the dominant plane.
+        support_height: height of the support plane along `up`, metres, or `auto` to find that which things stand on.
         target: candidates come from it alone; the other points still count for collision.
         approach: cone of directions of travel.
         max_grasps, min_score: how many to return, and the least score.
@@ -70,7 +71,7 @@ class GraspQuery:
 
     points: NDArray[np.float32]
     viewpoints: NDArray[np.float64] | None = None
-    up: NDArray[np.float64] | None = None
+    up: NDArray[np.float64] | Literal["auto"] | None = None
     workspace: Box | None = None
     support_height: float | Literal["auto"] | None = None
     target: Target | None = None
@@ -92,6 +93,11 @@ class GraspQuery:
     notes: tuple[str, ...] = ()
 
     @property
+    def known_up(self) -> NDArray[np.float64] | None:
+        """`up` (3,), or None where it is not given or still to be found."""
+        return None if isinstance(self.up, str) else self.up
+
+    @property
     def nbytes(self) -> int:
         """Bytes of its arrays that grow with the cloud."""
         arrays = (self.points, self.target, self.view_index, self.normals)
@@ -100,11 +106,16 @@ class GraspQuery:
     def __post_init__(self) -> None:
         if self.viewpoints is not None:
             object.__setattr__(self, "viewpoints", _viewpoints(self.viewpoints))
-        if self.up is not None:
+        if isinstance(self.up, str):
+            if self.up != "auto":
+                raise InvalidQuery("up", f"is {self.up!r}; give a direction x, y, z, or auto")
+        elif self.up is not None:
             object.__setattr__(self, "up", _direction("up", self.up))
         if self.support_height is not None:
             if self.up is None:
                 raise InvalidQuery("support_height", "needs `up`: a height is measured along it; give `up` as well")
+            if self.support_height != "auto" and isinstance(self.up, str):
+                raise InvalidQuery("support_height", "is measured along `up`, which is auto; give both, or neither")
             if self.support_height != "auto":
                 _in_range("support_height", self.support_height, -MAX_DISTANCE, MAX_DISTANCE, " m, or be auto")
                 object.__setattr__(self, "support_height", float(self.support_height))
@@ -164,8 +175,8 @@ class GraspQuery:
         object.__setattr__(
             self, "viewpoints", (np.zeros((1, 3)) if self.viewpoints is None else self.viewpoints) - origin
         )
-        if isinstance(self.support_height, float) and self.up is not None:
-            object.__setattr__(self, "support_height", self.support_height - float(self.up @ origin))
+        if isinstance(self.support_height, float) and self.known_up is not None:
+            object.__setattr__(self, "support_height", self.support_height - float(self.known_up @ origin))
 
 
 def _viewpoints(given: ArrayLike) -> NDArray[np.float64]:

@@ -2,7 +2,7 @@
 
 from __future__ import annotations
 
-from typing import Any
+from typing import Any, Literal
 
 import numpy as np
 from numpy.typing import NDArray
@@ -38,7 +38,7 @@ def build_query(payload: Payload, options: GraspOptions, max_points: int | None 
     return GraspQuery(
         points=payload.points,
         viewpoints=viewpoints,
-        up=None if options.up is None else np.array(options.up),
+        up=_up(payload, options),
         workspace=None if workspace is None else box_option("workspace", workspace.min, workspace.max),
         support_height=options.support_height,
         target=target,
@@ -58,6 +58,13 @@ def build_query(payload: Payload, options: GraspOptions, max_points: int | None 
         ignored_points=payload.ignored_points,
         notes=(*payload.notes, *seen, *note),
     )
+
+
+def _up(payload: Payload, options: GraspOptions) -> NDArray[np.float64] | Literal["auto"] | None:
+    """What is given; where nothing is, `up` is found in a camera's image."""
+    if options.up is None:
+        return None if payload.viewpoint is None else "auto"
+    return "auto" if options.up == "auto" else np.array(options.up)
 
 
 def _viewpoints(payload: Payload, options: GraspOptions) -> tuple[NDArray[np.float64] | None, tuple[str, ...]]:

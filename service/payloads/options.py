@@ -153,7 +153,7 @@ def unknown_option(name: str) -> Invalid:
     return Invalid(shortened(name), f"is no option; {hint}valid: {', '.join(known)}")
 
 
-_UNIONS = frozenset({"viewpoint", "support_height"})
+_UNIONS = frozenset({"viewpoint", "up", "support_height"})
 """Options of several types, whose names pydantic puts into an error's location."""
 
 _TYPES = frozenset({"GripperSize", "constrained-str"})

@@ -29,3 +29,8 @@ class Box:
             object.__setattr__(self, name, frozen(getattr(self, name), (3,), name))
         if not (self.minimum < self.maximum).all():
             raise ValueError(f"min {self.minimum.tolist()} is not below max {self.maximum.tolist()} on every axis")
+
+    def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
+        """Mask (N,) of the points (N, 3) that lie in it, its sides included."""
+        inside: NDArray[np.bool_] = ((points >= self.minimum) & (points <= self.maximum)).all(axis=1)
+        return inside

@@ -1,0 +1,281 @@
+"""Planes in a cloud, found from its local normals. Nothing is sampled at random.
+
+Knows no query and no hand, nor which plane things stand on: `tesnet.support` chooses. numpy only; lengths in metres.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Iterator
+from dataclasses import dataclass
+
+import numpy as np
+from numpy.typing import NDArray
+
+Array = NDArray[np.float64]
+Mask = NDArray[np.bool_]
+Indices = NDArray[np.intp]
+
+SAMPLE = 8_000
+"""Points that are looked at; of more, so many spread evenly over their order."""
+REACH = 10.0
+"""Of the median; what is farther is none of the scene."""
+PATCH = 0.03
+"""Edge of the cells whose points make one local normal: wide against the noise of a depth camera."""
+FEWEST_OF_PATCH = 6
+FLAT = 0.25
+"""A patch is flat where its least spread, as a standard deviation, is at most this share of the next."""
+DIRECTIONS = 500
+"""Directions that are voted for; some 6 degrees lie between neighbours."""
+MOST_DIRECTIONS, MOST_HEIGHTS = 5, 5
+LEAST_SHARE = 0.03
+"""Of the sample: fewer votes make no direction, and fewer points no plane."""
+FEWEST_POINTS = 60
+AGREEING, ALIGNED = np.cos(np.deg2rad([10.0, 20.0]))
+"""Normals within 10 degrees count for a direction; a plane's own patches are within 20."""
+BANDS = (0.03, 0.01, 0.01)
+"""Half thickness of the slab that a plane is fitted in, from coarse to fine."""
+DEVIATIONS = 3.0
+"""A plane's own points lie within so many standard deviations of its noise."""
+LEAST_BAND = 0.001
+LEAST_RADIUS = 1.5
+"""A surface that bends more than this is no plane, but the floor of a bin, say."""
+SQUARE = 0.04
+"""Edge of the squares of a footprint. A gap of one square, as behind things, does not part it."""
+SIDES = 24
+"""Of an outline."""
+_GOLDEN = (np.sqrt(5) - 1) / 2
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Plane:
+    """A piece of a plane.
+
+    Args:
+        up: (3,) unit normal.
+        height: along it.
+        noise_sd: robust standard deviation of its points about it.
+        sides: (S, 4) unit outward normals across `up`, and distances along them, of its convex outline.
+        own: mask (P,) of the sampled points that are its own.
+    """
+
+    up: Array
+    height: float
+    noise_sd: float
+    sides: Array
+    own: Mask
+
+    @property
+    def turned(self) -> Plane:
+        """The same, seen from its other side."""
+        return Plane(-self.up, -self.height, self.noise_sd, self.sides, self.own)
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Surfaces:
+    """A sample of a cloud and the flat patches of its surfaces.
+
+    Args:
+        points: (P, 3).
+        patch_of: (P,) the patch of each.
+        normals: (C, 3) unit, of unknown sign, of the patches.
+        votes: (C,) how many points a patch has; 0 where it is not flat.
+    """
+
+    points: Array
+    patch_of: Indices
+    normals: Array
+    votes: Array
+
+    @classmethod
+    def of(cls, cloud: NDArray[np.floating]) -> Surfaces:
+        """Those of a cloud (N, 3) with at least one point, within `REACH` of its median."""
+        points = spread(cloud, SAMPLE).astype(np.float64)
+        points = points[((points - np.median(points, axis=0)) ** 2).sum(axis=1) <= REACH**2]
+        _, patch_of, sizes = cells(points, PATCH)
+        counts = sizes.astype(np.float64)
+        means = np.stack([np.bincount(patch_of, points[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
+        deviations = points - means[patch_of]
+        covariances = np.empty((len(counts), 3, 3))
+        for row, column in ((0, 0), (0, 1), (0, 2), (1, 1), (1, 2), (2, 2)):
+            sums = np.bincount(patch_of, deviations[:, row] * deviations[:, column])
+            covariances[:, row, column] = covariances[:, column, row] = sums / counts
+        spreads, axes = np.linalg.eigh(covariances)
+        flat = (counts >= FEWEST_OF_PATCH) & (spreads[:, 0] <= FLAT**2 * spreads[:, 1])
+        return cls(points, patch_of, axes[:, :, 0], np.where(flat, counts, 0.0))
+
+    def directions(self) -> Iterator[Array]:
+        """Unit normals (3,), of either sign, that many patches share, most first."""
+        candidates, left = hemisphere(DIRECTIONS), self.votes.copy()
+        agreeing = np.abs(candidates @ self.normals.T) >= AGREEING
+        for _ in range(MOST_DIRECTIONS):
+            sums = agreeing @ left
+            best = int(sums.argmax())
+            if sums[best] < LEAST_SHARE * len(self.points):
+                return
+            direction = candidates[best]
+            for _ in range(3):  # to the mean of the normals about it
+                cosines = self.normals @ direction
+                weights = np.where(np.abs(cosines) >= AGREEING, np.sign(cosines), 0.0) * left
+                direction = weights @ self.normals
+                direction /= np.linalg.norm(direction)
+            yield direction
+            left[np.abs(self.normals @ direction) >= ALIGNED] = 0.0
+
+    def planes_near(self, direction: Array) -> Iterator[Plane]:
+        """The planes whose normal is about a unit direction (3,): each with the normal that fits its points best."""
+        for height, able, sure in self._heights(direction, BANDS[0]):
+            up, middle = direction, height
+            for band in BANDS:
+                residuals = self.points @ up - middle
+                own = able & (np.abs(residuals) <= band)
+                own &= np.abs(residuals) <= max(DEVIATIONS * robust_sd(residuals[own]), LEAST_BAND)
+                own = self._piece(up, own)
+                if own.sum() < FEWEST_POINTS:
+                    break
+                up, middle = least_squares(self.points[own & sure if (own & sure).sum() >= FEWEST_POINTS else own], up)
+            else:
+                yield from self._plane(up, middle, able, sure)
+
+    def planes_across(self, up: Array) -> Iterator[Plane]:
+        """The planes whose normal is a unit direction (3,)."""
+        for height, able, sure in self._heights(up, BANDS[-1]):
+            own = self._piece(up, able & (np.abs(self.points @ up - height) <= BANDS[-1]))
+            if own.sum() >= FEWEST_POINTS:
+                yield from self._plane(up, float(np.median(self.points[own] @ up)), able, sure)
+
+    def _heights(self, direction: Array, half: float) -> Iterator[tuple[float, Mask, Mask]]:
+        """Heights of slabs, fullest first, with the masks (P,) of points that may and that do belong to such planes.
+
+        Those that do lie in patches across the direction; those that may, also in patches that are not flat.
+        """
+        across = np.abs(self.normals @ direction) >= ALIGNED
+        able, sure = (across | (self.votes == 0))[self.patch_of], (across & (self.votes > 0))[self.patch_of]
+        heights, left = self.points @ direction, sure.copy()
+        for _ in range(MOST_HEIGHTS):
+            if left.sum() < max(FEWEST_POINTS, LEAST_SHARE * len(self.points)):
+                return
+            height = fullest(heights[left], half)
+            yield height, able, sure
+            left &= np.abs(heights - height) > 2 * half
+
+    def _plane(self, up: Array, height: float, able: Mask, sure: Mask) -> Iterator[Plane]:
+        """The plane there, unless it has too few points or is bent."""
+        residuals = self.points @ up - height
+        near = np.abs(residuals) <= BANDS[-1]
+        noise = robust_sd(residuals[near & sure])
+        own = self._piece(up, able & (np.abs(residuals) <= max(DEVIATIONS * noise, LEAST_BAND)))
+        enough = own.sum() >= max(FEWEST_POINTS, LEAST_SHARE * len(self.points))
+        if enough and radius(self.points[own & sure], up) >= LEAST_RADIUS:
+            yield Plane(up, height, noise, outline(self.points[own], up), own)
+
+    def _piece(self, up: Array, near: Mask) -> Mask:
+        """Of points (mask (P,)) about a plane, those of the largest piece that hangs together."""
+        rows = np.flatnonzero(near)
+        if len(rows) == 0:
+            return near
+        squares, square_of, _ = cells(self.points[rows] @ basis(up)[:, :2], SQUARE)
+        label = pieces(squares)[square_of]
+        kept = np.zeros_like(near)
+        kept[rows[label == np.bincount(label).argmax()]] = True
+        return kept
+
+
+def spread(cloud: NDArray[np.floating], most: int) -> NDArray[np.floating]:
+    """At most so many rows of a cloud, one in each stretch of its order, so that an image's rows and columns all count."""
+    if len(cloud) <= most:
+        return cloud
+    step = len(cloud) / most
+    number = np.arange(most)
+    return cloud[((number + (number * _GOLDEN) % 1.0) * step).astype(np.intp)]
+
+
+def cells(points: Array, edge: float) -> tuple[Indices, Indices, Indices]:
+    """Occupied cells (C, D) of a grid, the number (N,) of each point's (N, D) cell, and the cells' sizes (C,)."""
+    index = np.floor(points / edge).astype(np.intp)
+    index -= index.min(axis=0)
+    extent = index.max(axis=0) + 1
+    keys = np.ravel_multi_index(tuple(index.T), tuple(extent))
+    _, first, cell_of, counts = np.unique(keys, return_index=True, return_inverse=True, return_counts=True)
+    return index[first], cell_of.ravel(), counts
+
+
+def pieces(squares: Indices) -> Indices:
+    """(C,) which piece each of the squares (C, 2) belongs to: those at most two apart hang together."""
+    width = int(squares[:, 1].max()) + 5
+    keys = squares[:, 0] * width + squares[:, 1]  # in order, as `cells` gives them
+    steps = np.array([row * width + column for row in range(-2, 3) for column in range(-2, 3)])
+    wanted = keys[:, None] + steps
+    place = np.minimum(np.searchsorted(keys, wanted), len(keys) - 1)
+    neighbours = np.where(keys[place] == wanted, place, np.arange(len(keys))[:, None])
+    label = np.arange(len(keys))
+    while True:
+        lower = label[neighbours].min(axis=1)
+        lower = lower[lower]
+        if (lower == label).all():
+            return label
+        label = lower
+
+
+def basis(up: Array) -> Array:
+    """(3, 3) with two directions across `up` and, last, `up` as columns."""
+    across = np.cross(up, np.eye(3)[np.abs(up).argmin()])
+    across /= np.linalg.norm(across)
+    return np.stack([across, np.cross(up, across), up], axis=1)
+
+
+def hemisphere(count: int) -> Array:
+    """Unit directions (count, 3) spread evenly over half a sphere, along a spiral."""
+    z = (np.arange(count) + 0.5) / count
+    angle = 2 * np.pi * _GOLDEN * np.arange(count)
+    level = np.sqrt(1 - z**2)
+    return np.stack([level * np.cos(angle), level * np.sin(angle), z], axis=1)
+
+
+def fullest(heights: Array, half: float) -> float:
+    """The median height in the slab, of twice half a thickness, that holds most of the heights (C,)."""
+    ordered = np.sort(heights)
+    ends = np.searchsorted(ordered, ordered + 2 * half, side="right")
+    first = int((ends - np.arange(len(ordered))).argmax())
+    return float(np.median(ordered[first : ends[first]]))
+
+
+def least_squares(points: Array, up: Array) -> tuple[Array, float]:
+    """The unit normal (3,), on the side of `up`, and the height of the plane with the least squared distances."""
+    mean = points.mean(axis=0)
+    normal = np.linalg.eigh((points - mean).T @ (points - mean))[1][:, 0]
+    normal = normal if normal @ up >= 0 else -normal
+    return normal, float(mean @ normal)
+
+
+def robust_sd(residuals: Array) -> float:
+    """The standard deviation of normal residuals (N,) that a few others do not change: 1.4826 median |r - median r|."""
+    if len(residuals) == 0:
+        return 0.0
+    return float(1.4826 * np.median(np.abs(residuals - np.median(residuals))))
+
+
+def radius(points: Array, up: Array) -> float:
+    """The radius of the strongest bend of a surface that is nearly across `up`: of a paraboloid fitted to its points.
+
+    It is infinite for fewer points than make a paraboloid.
+    """
+    if len(points) < 6:
+        return np.inf
+    u, v, w = ((points - points.mean(axis=0)) @ basis(up)).T
+    terms = np.stack([u * u / 2, u * v, v * v / 2, u, v, np.ones_like(u)], axis=1)
+    xx, xy, yy = np.linalg.lstsq(terms, w, rcond=None)[0][:3]
+    bend = float(np.abs(np.linalg.eigvalsh([[xx, xy], [xy, yy]])).max())
+    return 1.0 / max(bend, 1e-9)
+
+
+def outline(points: Array, up: Array) -> Array:
+    """(SIDES, 4): the sides of the narrowest prism along `up`, of so many evenly turned sides, that holds the points."""
+    angle = 2 * np.pi * np.arange(SIDES) / SIDES
+    normals = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ basis(up)[:, :2].T
+    return np.column_stack([normals, (points @ normals.T).max(axis=0)])
+
+
+def within(points: NDArray[np.floating], sides: Array) -> Mask:
+    """Mask (N,) of points (N, 3) inside all sides (S, 4)."""
+    inside: Mask = (points @ sides[:, :3].T.astype(points.dtype) <= sides[:, 3].astype(points.dtype)).all(axis=1)
+    return inside
