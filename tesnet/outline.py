@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tesnet.cloud import SUPPORT_NOISE, PreparedCloud
+from tesnet.cloud import SUPPORT_NOISE, PreparedCloud, in_canonical_frame
 from tesnet.points import smallest_eigenvector
 from tesnet.query import GraspQuery
 from tesnet.ranges import RangeImage, range_image
@@ -128,7 +128,7 @@ def _falls_away(cloud: PreparedCloud, query: GraspQuery, edge: Tensor, outward: 
     """Mask (E,) of edge points beyond which every posted point is farther away, and one is, or the removed plane."""
     steps = torch.tensor(_BESIDE, device=edge.device)
     places = cloud.points[edge][:, None] + steps[:, None] * outward[:, None]
-    posted = _posted(cloud, query)
+    posted = in_canonical_frame(torch.from_numpy(query.points.copy()).to(edge.device), cloud.T_cloud_canonical)
     to_viewpoints = normalize(cloud.viewpoints[None] - cloud.points[edge][:, None], dim=2)
     viewer = (to_viewpoints * cloud.view_directions[edge][:, None]).sum(dim=2).argmax(dim=1)
     gap = torch.full(places.shape[:2], torch.nan, device=edge.device)
@@ -142,13 +142,6 @@ def _falls_away(cloud: PreparedCloud, query: GraspQuery, edge: Tensor, outward: 
     farther = (gap > _DROP) | empty
     seen_beyond = ~empty.all(dim=1)
     return farther.all(dim=1) & (seen_beyond | _where_plane_was_removed(cloud, posted, edge))
-
-
-def _posted(cloud: PreparedCloud, query: GraspQuery) -> Tensor:
-    """All points of the query (N, 3), in the canonical frame."""
-    points = torch.from_numpy(query.points.copy()).to(cloud.points.device).double()
-    rotation = torch.tensor(cloud.T_cloud_canonical.rotation, device=points.device)
-    return ((points - torch.tensor(cloud.T_cloud_canonical.translation, device=points.device)) @ rotation).float()
 
 
 def _image(viewpoint: Tensor, posted: Tensor, places: Tensor) -> RangeImage | None:
