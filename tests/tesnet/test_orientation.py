@@ -59,6 +59,18 @@ def test_the_direction_of_view_is_to_a_camera_on_the_outer_side_that_saw_the_poi
     assert (nearest < 0.005).mean() > 0.97
 
 
+def test_a_viewpoint_straight_before_a_wall_is_not_chosen_where_a_screen_stands_between() -> None:
+    """The screen hides the wall from the camera most nearly along its normal; two others see it past the screen."""
+    screened = (Slab((0.0, 0.0, 0.0), (0.03, 0.10, 0.05)), Slab((0.07, 0.0, 0.0), (0.01, 0.20, 0.12)))
+    cloud, _ = looked_at(screened, np.array([[0.6, 0.0, 0.1], [0.15, 0.3, 0.55], [0.15, -0.4, 0.5]]))
+    positions = cloud.T_cloud_canonical.apply(cloud.points.double().numpy())
+    of_wall = (np.abs(positions[:, 0] - 0.015) < 0.004) & (positions[:, 2] < 0.045)
+    assert of_wall.sum() > 100
+    to_cameras = torch.nn.functional.normalize(cloud.viewpoints[None] - cloud.points[:, None], dim=2)
+    chosen = (to_cameras * cloud.view_directions[:, None]).sum(dim=2).argmax(dim=1).numpy()
+    assert (chosen[of_wall] != 0).mean() > 0.95
+
+
 def test_the_chosen_viewpoints_do_not_depend_on_signs_and_move_with_the_cloud() -> None:
     cloud, _ = looked_at(THINGS, around(3))
     signs = torch.from_numpy(np.random.default_rng(0).choice([-1.0, 1.0], (len(cloud), 1))).float()
