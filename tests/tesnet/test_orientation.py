@@ -89,12 +89,18 @@ def test_the_chosen_viewpoints_do_not_depend_on_signs_and_move_with_the_cloud() 
     assert (((moved.double() @ turn) * plain).sum(dim=1) > 0.9999).double().mean() > 0.99
 
 
-def test_a_viewpoint_that_has_every_point_behind_it_saw_none() -> None:
-    wall = torch.tensor([[x, y, 0.0] for x in np.linspace(0, 0.1, 30) for y in np.linspace(0, 0.1, 30)]).float()
-    normals = torch.tensor([0.0, 0.0, 1.0]).expand_as(wall)
-    viewpoints = torch.tensor([[0.3, 0.0, 0.3], [0.0, 0.0, 0.6]])
-    towards = towards_who_saw(wall, normals, pts.nearest_neighbours(wall, 16), viewpoints)
-    torch.testing.assert_close(towards, torch.nn.functional.normalize(viewpoints[1] - wall, dim=1))
+def test_a_viewpoint_saw_nothing_that_lies_behind_it() -> None:
+    """A camera looks down at a floor, with its back to a shelf that another one sees from above, less squarely."""
+    grid = torch.linspace(-0.1, 0.1, 45)
+    floor = torch.cartesian_prod(grid, grid, torch.zeros(1))
+    shelf = torch.cartesian_prod(grid[::2], grid[::2], torch.full((1,), 0.5))
+    points = torch.cat([shelf, floor])
+    normals = torch.tensor([0.0, 0.0, 1.0]).expand_as(points)
+    viewpoints = torch.tensor([[0.0, 0.0, 0.3], [0.3, 0.0, 0.9]])
+    towards = towards_who_saw(points, normals, pts.nearest_neighbours(points, 16), viewpoints)
+    expected = torch.nn.functional.normalize(viewpoints[1] - shelf, dim=1)
+    torch.testing.assert_close(towards[: len(shelf)], expected)
+    assert float(towards[len(shelf) :, 2].min()) > 0
 
 
 @pytest.mark.parametrize("count", [1, 3])
