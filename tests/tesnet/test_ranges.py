@@ -43,6 +43,16 @@ def test_an_empty_pixel_one_beyond_the_image_and_one_behind_the_viewer_hold_noth
     assert int(first[3]) < len(ring)
 
 
+def test_a_place_behind_the_viewer_is_not_in_the_pixel_before_it() -> None:
+    grid = np.linspace(-0.1, 0.1, 41)
+    wall = of([[x, y, 0.0] for x in grid for y in grid])
+    image = range_image(of([[0.0, 0.0, 0.5]])[0], wall)
+    assert image is not None
+    _, first = image.look(of([[0.0, 0.0, 0.0], [0.0, 0.0, 0.9]]))
+    assert int(first[0]) < len(wall)
+    assert int(first[1]) == len(wall)
+
+
 def test_there_is_no_image_of_what_lies_behind_the_viewer_alone() -> None:
     """Of points on all sides of a viewpoint in their middle, half have no pixel."""
     points = of([[0.0, 0.0, 1.0], [0.0, 0.1, -1.0], [0.1, 0.0, -1.0]])
