@@ -13,6 +13,7 @@ from torch import Tensor
 
 from tesnet import cloud
 from tesnet.geometry import Box, Pose
+from tests.tesnet.raycast import Can, around, cast
 from tests.tesnet.scenes import (
     CAMERA,
     CPU,
@@ -184,3 +185,18 @@ def test_normals_of_zeros_leave_the_orientation_to_the_viewpoints() -> None:
     plain = prepared(ask(points, viewpoints=cameras, up=UP))
     same = prepared(ask(points, viewpoints=cameras, up=UP, normals=np.zeros_like(points)))
     assert torch.equal(plain.normals, same.normals)
+
+
+@pytest.mark.parametrize("told_by", ["view_index", "normals"])
+def test_who_saw_a_point_or_the_normals_that_came_with_it_turn_the_normals(told_by: str) -> None:
+    """Told the contrary of what two cameras saw of a can from both sides, walls face inward."""
+    views = cast((Can((0.0, 0.0, 0.0), 0.03, 0.1),), around(2, polar_deg=80), np.random.default_rng(0))
+    seen = ask(views.points, viewpoints=views.cameras, up=UP)
+    contrary = {"view_index": 1 - views.view_index, "normals": -views.normals}[told_by]
+    told = prepared(ask(views.points, viewpoints=views.cameras, up=UP, **{told_by: contrary}))
+    plain = prepared(seen)
+    facing = (plain.view_directions * plain.normals).sum(dim=1)
+    walls = ((plain.normals @ torch.tensor(UP).float()).abs() < 0.3) & (facing > 0.4)
+    assert int(walls.sum()) > 100
+    reversed_ = (told.normals * plain.normals).sum(dim=1) < -0.999
+    assert float(reversed_[walls].float().mean()) > 0.98
