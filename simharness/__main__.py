@@ -33,7 +33,7 @@ from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFol
 from simharness.play.photographer import attempts_to_show, keep_only, take_pictures
 from simharness.play.records import Run
 from simharness.play.replay import find_attempt, replay
-from simharness.play.round import camera_noise
+from simharness.play.round import camera_sensor
 from simharness.play.run import Hooks, run
 from simharness.play.settings import RunSettings
 from simharness.report.causes import failures, failures_report, failures_table
@@ -98,7 +98,7 @@ def _robustness(options: argparse.Namespace) -> int:
 
 def _clear(options: argparse.Namespace, settings: RunSettings, folder: RunFolder) -> tuple[Run, int]:
     """Carry a run out, leave its reports, print its table; the run and the exit code."""
-    check_sensing(settings.camera, camera_noise(settings))
+    check_sensing(settings.camera, camera_sensor(settings))
     objects = _objects(settings)
     signals = _Signals()
     with ExitStack() as stack:

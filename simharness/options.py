@@ -180,9 +180,10 @@ def _form(kind: Any, flag: Flag) -> dict[str, Any]:
     """How argparse is told what a flag takes."""
     if flag.choices is not None:
         return {"choices": flag.choices}
-    if get_origin(kind) is Literal:
-        return {"choices": get_args(kind)}
     kinds = {kind, *get_args(kind)}  # of `float | None` both
+    for choice in kinds:
+        if get_origin(choice) is Literal:
+            return {"choices": get_args(choice)}
     if bool in kinds:
         return {"action": argparse.BooleanOptionalAction}
     parse: Any = str

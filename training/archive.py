@@ -21,11 +21,12 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from simharness.play.crew import Emit, Work, crew
-from simharness.sim.camera import PRESET_NOISE, Preset, observe_from, sample_camera
+from simharness.sim.camera import PRESET_SENSOR, Preset, observe_from, sample_camera
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcomes import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
 from simharness.sim.scene import restore_scene
+from simharness.sim.sensors.catalogue import SENSORS
 from simharness.sim.world import World
 from tesnet import cloud
 from tesnet.candidates import grasp_poses
@@ -386,7 +387,7 @@ def _render_view(
 ) -> LabelledView | None:
     preset: Preset = "random" if len(view.Ts_world_camera) == 1 else "multi3"
     cameras = [Pose.from_matrix(matrix) for matrix in view.Ts_world_camera]
-    observation = observe_from(world, cameras, rng, PRESET_NOISE[preset])
+    observation = observe_from(world, cameras, rng, SENSORS[PRESET_SENSOR[preset]])
     query = query_about(observation)
     prepared = cloud.prepare(query, preparation, torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:

@@ -24,11 +24,14 @@ from simharness.play.records import (
     RoundRecord,
 )
 from simharness.play.settings import RunSettings
-from simharness.sim.camera import PRESET_NOISE, Noise, Observation, observe
+from simharness.sim.camera import PRESET_SENSOR, Observation, Stand, observe
 from simharness.sim.execute import Outcome, attempt
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import make_scene, scales_for
+from simharness.sim.sensors.catalogue import SENSORS
+from simharness.sim.sensors.gaussian import DepthGaussian, GammaScale, PatchNoise
+from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
 from tesnet.geometry import PANDA, Gripper
 
@@ -150,16 +153,18 @@ def request_seed(seed: int, round_number: int, observation: int) -> int:
     return int(sequence.generate_state(1)[0] >> 1)
 
 
-def camera_noise(settings: RunSettings) -> Noise:
-    """The noise of a run's camera: its preset's, with what the settings replace."""
-    noise = PRESET_NOISE[settings.camera]
-    if settings.noise_std is not None:
-        noise = replace(noise, point_sigma=settings.noise_std)
-    if settings.depth_noise_std is not None:
-        noise = replace(noise, depth_sigma=settings.depth_noise_std)
+def camera_sensor(settings: RunSettings) -> Sensor:
+    """The sensor of a run's camera: the one named or its preset's, with what the settings replace."""
+    sensor = SENSORS[settings.sensor or PRESET_SENSOR[settings.camera]]
     if settings.dex_noise is not None:
-        noise = replace(noise, dex=settings.dex_noise)
-    return noise
+        sensor = sensor.without(GammaScale).without(PatchNoise)
+        sensor = replace(sensor, depth=SENSORS["dex"].depth + sensor.depth) if settings.dex_noise else sensor
+    if settings.depth_noise_std is not None:
+        sensor = sensor.without(DepthGaussian)
+        sensor = sensor.with_part(DepthGaussian(settings.depth_noise_std)) if settings.depth_noise_std else sensor
+    if settings.noise_std is not None:
+        sensor = replace(sensor, point_sigma=settings.noise_std)
+    return sensor
 
 
 def play_round(
@@ -224,7 +229,8 @@ class _Table:
         self._round = round_number
         self._tell: Listener = listener or (lambda _event: None)
         self._segmentation = segmentation
-        self._noise = camera_noise(settings)
+        self._sensor = camera_sensor(settings)
+        self._stand = Stand(settings.polar_deg, settings.distance)
         self.attempts: list[AttemptRecord] = []
         self.no_grasps: list[NoGraspRecord] = []
 
@@ -253,8 +259,9 @@ class _Table:
             self._world,
             self._settings.camera,
             rng,
-            self._noise,
-            polar_deg=self._settings.polar_deg,
+            self._sensor,
+            stand=self._stand,
+            table_in_view=bool(self._settings.table_in_view),
             voxel_size=self._settings.voxel_size,
             segmentation=self._segmentation,
         )

@@ -12,6 +12,7 @@ from typing import Annotated, Any, Literal, get_args, get_origin, get_type_hints
 from simharness.sim.camera import Preset
 from simharness.sim.execute import Executor
 from simharness.sim.objects import SceneKind
+from simharness.sim.sensors.catalogue import SensorName
 from tesnet.hands import HANDS, KnownHand
 
 Part = Literal["round", "model", "camera"]
@@ -98,7 +99,7 @@ class RunSettings:
         Flag(
             "camera",
             "random: one view from somewhere above; giga: one fixed view from the side; multi3: three views; "
-            "vgn6: six views",
+            "vgn6: six views; top: one view from straight above",
             default="random",
         ),
     ]
@@ -134,7 +135,7 @@ class RunSettings:
             "camera",
             "angle of the views from straight above (default: the camera's)",
             "DEG",
-            within=Interval(0, 90, "degrees"),
+            within=Interval(0, 90, "degrees", from_low=True),
         ),
     ] = None
     voxel_size: Annotated[
@@ -145,6 +146,23 @@ class RunSettings:
             "M",
             within=Interval(0, 1, "metres"),
         ),
+    ] = None
+    sensor: Annotated[
+        SensorName | None,
+        Flag("camera", "what measures depth, as simharness/sim/sensors/catalogue.py has it (default: the camera's)"),
+    ] = None
+    distance: Annotated[
+        float | None,
+        Flag(
+            "camera",
+            "from the cameras to the middle of the table's top, at which they then look, metres "
+            "(default: the camera's)",
+            "M",
+            within=Interval(0.2, 1.5, "metres"),
+        ),
+    ] = None
+    table_in_view: Annotated[
+        bool | None, Flag("camera", "send the table too, not what stands on it alone (default: not)")
     ] = None
 
     gripper: Annotated[

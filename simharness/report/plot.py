@@ -1,4 +1,4 @@
-"""Rates with their intervals as one SVG drawing: panels side by side, a line of dots for each series."""
+"""Rates with their intervals as one SVG drawing: panels in rows, a line of dots for each series."""
 
 from __future__ import annotations
 
@@ -13,6 +13,13 @@ _COLOURS = ("#2563eb", "#d97706", "#16a34a", "#7c3aed")
 _INK, _SOFT, _LINE = "#0f172a", "#64748b", "#e2e8f0"
 _PANEL_WIDTH, _PLOT_HEIGHT = 330, 230
 _LEFT, _RIGHT, _TOP, _BOTTOM = 44, 14, 76, 66
+_LEVEL_WIDTH = 72
+"""Pixels that a level and its label need at least."""
+
+_DRAWING_WIDTH = 5 * _PANEL_WIDTH
+"""Pixels at which a row is full."""
+
+_ROW_HEIGHT = _PLOT_HEIGHT + _BOTTOM + 34
 _APART = 9
 """Pixels between the dots of two series at one level."""
 
@@ -45,8 +52,9 @@ def plot(title: str, panels: Sequence[Panel]) -> str:
         panels: with the same names of series.
     """
     floor, step = _scale(panels)
-    width = len(panels) * _PANEL_WIDTH
-    height = _TOP + _PLOT_HEIGHT + _BOTTOM
+    places = _places(panels)
+    width = max((x + _width(panel) for panel, (x, _) in zip(panels, places, strict=True)), default=_PANEL_WIDTH)
+    height = _TOP + _PLOT_HEIGHT + _BOTTOM + max((y for _, y in places), default=0)
     size = f'width="{width}" height="{height}"'
     parts = [
         f'<svg xmlns="http://www.w3.org/2000/svg" {size} font-family="system-ui, sans-serif">',
@@ -54,14 +62,30 @@ def plot(title: str, panels: Sequence[Panel]) -> str:
         _text(_LEFT, 22, title, size=14, colour=_INK, anchor="start"),
         *_legend(list(panels[0].series) if panels else []),
     ]
-    for number, panel in enumerate(panels):
-        parts.append(f'<g transform="translate({number * _PANEL_WIDTH} 0)">')
+    for panel, (across, down) in zip(panels, places, strict=True):
+        parts.append(f'<g transform="translate({across} {down})">')
         parts += _axes(panel, floor, step)
         for index, (name, rates) in enumerate(panel.series.items()):
             shift = _APART * (index - (len(panel.series) - 1) / 2)
             parts += _series(panel, name, rates, shift, _COLOURS[index % len(_COLOURS)], floor)
         parts.append("</g>")
     return "\n".join([*parts, "</svg>"]) + "\n"
+
+
+def _width(panel: Panel) -> int:
+    return max(_PANEL_WIDTH, _LEVEL_WIDTH * len(panel.levels))
+
+
+def _places(panels: Sequence[Panel]) -> list[tuple[int, int]]:
+    """Where each panel's upper left corner lies: from left to right, in a new row where the last one is full."""
+    places = []
+    x = y = 0
+    for panel in panels:
+        if x and x + _width(panel) > _DRAWING_WIDTH:
+            x, y = 0, y + _ROW_HEIGHT
+        places.append((x, y))
+        x += _width(panel)
+    return places
 
 
 def _scale(panels: Sequence[Panel]) -> tuple[int, int]:
@@ -73,7 +97,7 @@ def _scale(panels: Sequence[Panel]) -> tuple[int, int]:
 
 
 def _axes(panel: Panel, floor: int, step: int) -> list[str]:
-    right = _PANEL_WIDTH - _RIGHT
+    right = _width(panel) - _RIGHT
     parts = [_text((_LEFT + right) / 2, _TOP - 12, panel.title, size=12, colour=_INK)]
     for percent in range(floor, 101, step):
         y = _y(percent, floor)
@@ -115,7 +139,7 @@ def _legend(names: Sequence[str]) -> list[str]:
 
 
 def _x(panel: Panel, index: int) -> float:
-    room = _PANEL_WIDTH - _LEFT - _RIGHT
+    room = _width(panel) - _LEFT - _RIGHT
     return _LEFT + room * (index + 0.5) / len(panel.levels)
 
 

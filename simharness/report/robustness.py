@@ -17,12 +17,23 @@ from simharness.play.records import ModelRecord, Run
 from simharness.play.settings import RunSettings
 from simharness.report.plot import Panel, plot
 from simharness.report.report import numbers, title
+from simharness.sim.sensors.catalogue import SensorName
 
 JSON_FILE = "robustness.json"
 TABLE_FILE = "robustness.md"
 PLOT_FILE = "robustness.svg"
 
-AxisName = Literal["noise", "viewpoint", "points"]
+AxisName = Literal[
+    "noise",
+    "sensor",
+    "viewpoint",
+    "distance",
+    "points",
+    "d435-viewpoint",
+    "d435-distance",
+    "d415-viewpoint",
+    "d415-distance",
+]
 AXIS_NAMES: tuple[AxisName, ...] = get_args(AxisName)
 
 
@@ -60,32 +71,84 @@ class Axis:
     joined: int
 
 
+_ANGLES_DEG = (0, 15, 30, 45, 60, 75, 80)
+_DISTANCES_MM = (350, 500, 700, 900, 1200)
+_NEAREST_D415_MM = 500  # it sees nothing under 0.44 m
+
+
+def _viewpoints(prefix: str = "", **changes: Any) -> tuple[Condition, ...]:
+    return tuple(
+        Condition(f"{prefix}polar-{angle}deg", f"{angle} deg", {"polar_deg": float(angle), **changes})
+        for angle in _ANGLES_DEG
+    )
+
+
+def _distances(prefix: str = "", nearest_mm: int = 0, **changes: Any) -> tuple[Condition, ...]:
+    return tuple(
+        Condition(f"{prefix}distance-{distance}mm", f"{distance / 1000:g} m", {"distance": distance / 1000, **changes})
+        for distance in _DISTANCES_MM
+        if distance >= nearest_mm
+    )
+
+
+def _sensor(name: SensorName, label: str = "") -> Condition:
+    return Condition(f"sensor-{name}", label or name, {"sensor": name})
+
+
+_UNCHANGED = "unchanged"
+_NO_NOISE = Condition("noise-0", "none", {"noise_std": 0.0})
+_DEX = Condition("noise-giga", "giga's", {"noise_std": 0.0, "dex_noise": True})
+
 AXES: Mapping[AxisName, Axis] = {
     "noise": Axis(
         "Noise on each coordinate of each point",
         (
-            Condition("noise-0", "none", {"noise_std": 0.0}),
-            Condition("unchanged", "0.8 mm"),
+            _NO_NOISE,
+            Condition(_UNCHANGED, "0.8 mm"),
             Condition("noise-2mm", "2 mm", {"noise_std": 0.002}),
             Condition("noise-4mm", "4 mm", {"noise_std": 0.004}),
-            Condition("noise-giga", "giga's", {"noise_std": 0.0, "dex_noise": True}),
+            _DEX,
         ),
         joined=4,
     ),
-    "viewpoint": Axis(
-        "Angle of the view from straight above",
-        tuple(
-            Condition(f"polar-{angle}deg", f"{angle} deg", {"polar_deg": float(angle)}) for angle in range(15, 90, 15)
+    "sensor": Axis(
+        "Sensor, 0.6-0.75 m away",
+        (
+            replace(_NO_NOISE, label="ideal"),
+            Condition(_UNCHANGED, "gaussian"),
+            _sensor("dropout"),
+            _sensor("flying"),
+            _sensor("d415"),
+            _sensor("d435"),
+            _sensor("d435-pose", "d435, pose"),
+            _sensor("d435-uncalibrated", "d435, all"),
+            _sensor("tof"),
+            _sensor("simkinect"),
+            _sensor("redwood"),
+            _sensor("patches"),
+            replace(_DEX, label="dex"),
         ),
-        joined=5,
+        joined=0,
     ),
+    "viewpoint": Axis("Angle of the view from straight above", _viewpoints(), joined=7),
+    "distance": Axis("Distance from the table's middle", _distances(), joined=5),
     "points": Axis(
         "Voxels that keep one point each",
         (
-            Condition("unchanged", "every point"),
+            Condition(_UNCHANGED, "every point"),
             *(Condition(f"voxel-{edge}mm", f"{edge} mm", {"voxel_size": edge / 1000}) for edge in (3, 5, 7, 10)),
         ),
         joined=5,
+    ),
+    "d435-viewpoint": Axis(
+        "D435: angle of the view from straight above", _viewpoints("d435-", sensor="d435"), joined=7
+    ),
+    "d435-distance": Axis("D435: distance from the table's middle", _distances("d435-", sensor="d435"), joined=5),
+    "d415-viewpoint": Axis(
+        "D415: angle of the view from straight above", _viewpoints("d415-", sensor="d415"), joined=7
+    ),
+    "d415-distance": Axis(
+        "D415: distance from the table's middle", _distances("d415-", _NEAREST_D415_MM, sensor="d415"), joined=4
     ),
 }
 

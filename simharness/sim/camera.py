@@ -1,4 +1,4 @@
-"""Depth, colour and segmentation images from a pose, sensor noise, and the cloud that a planner is shown.
+"""Depth, colour and segmentation images from a pose, through a sensor, and the cloud that a planner is shown.
 
 OpenGL's camera axes exist only inside this file; everything outside has +x right, +y down, +z forward.
 """
@@ -15,11 +15,14 @@ from jaxtyping import Float32, Float64, Int32, UInt8
 from numpy.typing import NDArray
 
 from simharness.errors import from_extra
-from simharness.sim.scene import PERCEPTION_BOX, WORKSPACE
+from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT, WORKSPACE
+from simharness.sim.sensors.catalogue import SENSORS, SensorName
+from simharness.sim.sensors.images import ndimage
+from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
 from tesnet.geometry import Box, CameraIntrinsics, Pose
 
-Preset = Literal["random", "giga", "multi3", "vgn6"]
+Preset = Literal["random", "giga", "multi3", "vgn6", "top"]
 PRESETS: tuple[Preset, ...] = get_args(Preset)
 FUSED: tuple[Preset, ...] = ("multi3", "vgn6")
 """Presets of several views, which become one cloud."""
@@ -28,32 +31,22 @@ INTRINSICS = CameraIntrinsics(width=640, height=480, fx=540.0, fy=540.0, cx=320.
 NEAR, FAR = 0.1, 2.0
 """Metres; nothing nearer or farther is seen."""
 
+_TABLE_BOX = Box(np.array([-0.1, -0.1, -0.1]), np.array([0.4, 0.4, 0.35]))
+"""Table and things as far as wrong scales and poses may move them."""
+
+_TABLE_MIDDLE = (0.15, 0.15, TABLE_HEIGHT)
 _FUSION_VOXELS = 120
 _FUSION_TRUNCATION_VOXELS = 4
 
 
-@dataclass(frozen=True, slots=True)
-class Noise:
-    """What a depth sensor adds; everything off by default.
-
-    Args:
-        point_sigma: standard deviation of each coordinate of each point, metres.
-        depth_sigma: standard deviation of each pixel's depth, metres.
-        dex: multiplicative gamma and correlated Gaussian depth noise of Mahler et al., "Dex-Net 2.0" (RSS 2017): shape
-            1000 and scale 0.001; sigma 5 mm on a grid four times coarser than the image.
-    """
-
-    point_sigma: float = 0.0
-    depth_sigma: float = 0.0
-    dex: bool = False
-
-
-PRESET_NOISE: Mapping[Preset, Noise] = {
-    "random": Noise(point_sigma=0.0008),
-    "giga": Noise(dex=True),
-    "multi3": Noise(point_sigma=0.0008),
-    "vgn6": Noise(),
+PRESET_SENSOR: Mapping[Preset, SensorName] = {
+    "random": "gaussian",
+    "giga": "dex",
+    "multi3": "gaussian",
+    "vgn6": "ideal",
+    "top": "gaussian",
 }
+"""Names of the sensors that presets have unless another is asked for."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -83,15 +76,17 @@ class Observation:
 
     Args:
         points_world: cloud inside the perception box, metres.
-        viewpoints: camera positions in the world, metres.
-        Ts_world_camera: camera poses (4, 4).
+        viewpoints: camera positions in the world, metres, as the planner believes them to be.
+        Ts_world_camera: true camera poses (4, 4).
         images: one set a camera, without noise.
+        table_height: of the table's top, metres, as the planner believes it to be.
     """
 
     points_world: Float32[np.ndarray, "points 3"]
     viewpoints: Float64[np.ndarray, "views 3"]
     Ts_world_camera: Float64[np.ndarray, "views 4 4"]
     images: tuple[Images, ...]
+    table_height: float = TABLE_HEIGHT
 
     def __post_init__(self) -> None:
         for name, kind in (("points_world", np.float32), ("viewpoints", np.float64), ("Ts_world_camera", np.float64)):
@@ -100,24 +95,45 @@ class Observation:
             object.__setattr__(self, name, array)
 
 
-def sample_camera(preset: Preset, rng: np.random.Generator, polar_deg: float | None = None) -> tuple[Pose, ...]:
+@dataclass(frozen=True, slots=True)
+class Stand:
+    """What is asked of where cameras stand; None leaves it to the preset.
+
+    Args:
+        polar_deg: angle of every view from straight above, 0 to 90.
+        distance: metres from every camera to the middle of the table's top, which it then looks at.
+    """
+
+    polar_deg: float | None = None
+    distance: float | None = None
+
+
+AS_PRESET = Stand()
+"""Everything as the preset has it."""
+
+
+def sample_camera(preset: Preset, rng: np.random.Generator, stand: Stand = AS_PRESET) -> tuple[Pose, ...]:
     """T_world_camera of each view of a preset.
 
     `random`: one view on a sphere about (0.15, 0.15, 0.25), radius 0.6-0.75 m, polar angle 45-60 deg, azimuth 0-180
     deg. `giga`: one fixed view from the side. `multi3`: three views like `random`'s, 120 deg apart, azimuth of the
-    first 0-120 deg. `vgn6`: six views on a circle, polar angle 30 deg, radius 0.6 m.
+    first 0-120 deg. `vgn6`: six views on a circle, polar angle 30 deg, radius 0.6 m. `top`: one view from straight
+    above, 0.6 m over the table.
 
     Args:
         preset: which views.
         rng: source of what is random about them.
-        polar_deg: replaces the polar angle of every view, more than 0 and at most 90; the rest stays as it was.
+        stand: what replaces the preset's; the rest stays as it was.
 
     Raises:
         ValueError: an unknown preset; the message lists the valid ones.
     """
 
     def on_sphere(centre: tuple[float, float, float], radius: float, polar: float, azimuth: float) -> Pose:
-        return _on_sphere(centre, radius, polar if polar_deg is None else polar_deg, azimuth)
+        polar = polar if stand.polar_deg is None else stand.polar_deg
+        if stand.distance is not None:
+            centre, radius = _TABLE_MIDDLE, stand.distance
+        return _on_sphere(centre, radius, polar, azimuth)
 
     if preset == "random":
         radius, polar, azimuth = rng.uniform(0.6, 0.75), rng.uniform(45, 60), rng.uniform(0, 180)
@@ -129,6 +145,8 @@ def sample_camera(preset: Preset, rng: np.random.Generator, polar_deg: float | N
         return tuple(on_sphere((0.15, 0.15, 0.25), radius, polar, azimuth + turn) for turn in (0, 120, 240))
     if preset == "vgn6":
         return tuple(on_sphere((0.15, 0.15, 0.0), 0.6, 30, azimuth) for azimuth in range(0, 360, 60))
+    if preset == "top":
+        return (on_sphere(_TABLE_MIDDLE, 0.6, 0, -90),)
     raise ValueError(f"unknown camera preset {preset!r}; valid: {', '.join(PRESETS)}")
 
 
@@ -155,72 +173,70 @@ def observe(
     world: World,
     preset: Preset,
     rng: np.random.Generator,
-    noise: Noise | None = None,
+    sensor: Sensor | None = None,
     *,
-    polar_deg: float | None = None,
+    stand: Stand = AS_PRESET,
+    table_in_view: bool = False,
     voxel_size: float | None = None,
     segmentation: bool = False,
 ) -> Observation:
-    """Sample a camera and look: depth, depth noise, points, crop to the perception box, point noise, in this order.
+    """Sample a camera and look: depth, depth errors, points, crop to the perception box, point noise, in this order.
 
     Noise before the crop would lift points of the table into the box. Presets with several views are fused.
 
     Args:
         world: what is seen.
         preset: where cameras stand.
-        rng: source of the cameras' poses, then of the noise.
-        noise: the preset's own unless given.
-        polar_deg: replaces the preset's polar angle.
+        rng: source of the cameras' poses, then of the sensor's errors.
+        sensor: the preset's own unless given.
+        stand: what replaces the preset's poses.
+        table_in_view: leave the table, around the workspace too, in the cloud.
         voxel_size: edge of the voxels to which the cloud is thinned at last, metres; None keeps every point.
         segmentation: whether the images shall hold body ids.
     """
-    cameras = sample_camera(preset, rng, polar_deg)
-    noise = noise or PRESET_NOISE[preset]
-    return observe_from(world, cameras, rng, noise, voxel_size=voxel_size, segmentation=segmentation)
+    cameras = sample_camera(preset, rng, stand)
+    sensor = sensor or SENSORS[PRESET_SENSOR[preset]]
+    return observe_from(
+        world, cameras, rng, sensor, table_in_view=table_in_view, voxel_size=voxel_size, segmentation=segmentation
+    )
 
 
 def observe_from(
     world: World,
     cameras: Sequence[Pose],
     rng: np.random.Generator,
-    noise: Noise,
+    sensor: Sensor,
     *,
+    table_in_view: bool = False,
     voxel_size: float | None = None,
     segmentation: bool = False,
 ) -> Observation:
     """`observe` from given poses T_world_camera; several views are fused into one cloud."""
     images = tuple(render(world, camera, segmentation=segmentation) for camera in cameras)
-    depths = [add_depth_noise(image.depth, noise, rng) for image in images]
+    believed = [sensor.calibration.believed_pose(camera, rng) for camera in cameras]
+    table_height = TABLE_HEIGHT + sensor.calibration.height_error(rng)
+    scale = sensor.calibration.scale_error(rng)
+    depths = [sensor.measure(image.depth, INTRINSICS, rng) * np.float32(scale) for image in images]
     single = len(cameras) == 1
-    points = cameras[0].apply(INTRINSICS.back_project(depths[0])) if single else _fuse(depths, cameras)
-    points = crop(points, PERCEPTION_BOX)
-    if noise.point_sigma > 0:
-        points = points + rng.normal(0.0, noise.point_sigma, points.shape)
+    points = believed[0].apply(INTRINSICS.back_project(depths[0])) if single else _fuse(depths, believed)
+    points = crop(points, _TABLE_BOX if table_in_view else perception_box(table_height))
+    if sensor.point_sigma > 0:
+        points = points + rng.normal(0.0, sensor.point_sigma, points.shape)
     if voxel_size is not None:
         points = thin(points, voxel_size)
     return Observation(
         points.astype(np.float32),
-        np.stack([camera.translation for camera in cameras]),
+        np.stack([camera.translation for camera in believed]),
         np.stack([camera.matrix for camera in cameras]),
         images,
+        table_height,
     )
 
 
-def add_depth_noise(
-    depth: Float32[np.ndarray, "height width"], noise: Noise, rng: np.random.Generator
-) -> Float32[np.ndarray, "height width"]:
-    """A depth image (metres) as a noisy sensor would give it; pixels that see nothing stay 0."""
-    if not noise.dex and noise.depth_sigma == 0:
-        return depth
-    seen = depth > 0
-    noisy = depth.astype(np.float64)
-    if noise.dex:
-        noisy = noisy * rng.gamma(1000.0, 0.001)
-        coarse = rng.normal(0.0, 0.005, (depth.shape[0] // 4, depth.shape[1] // 4))
-        noisy = noisy + _ndimage().zoom(coarse, 4, order=3, mode="nearest", grid_mode=True)
-    if noise.depth_sigma > 0:
-        noisy = noisy + rng.normal(0.0, noise.depth_sigma, depth.shape)
-    return np.where(seen, np.maximum(noisy, 1e-3), 0.0).astype(np.float32)
+def perception_box(table_height: float) -> Box:
+    """What a planner is shown that believes the table to be so high, metres."""
+    minimum = PERCEPTION_BOX.minimum + np.array([0.0, 0.0, table_height - TABLE_HEIGHT])
+    return Box(minimum, PERCEPTION_BOX.maximum)
 
 
 def crop(points: Float64[np.ndarray, "points 3"], box: Box) -> Float64[np.ndarray, "inside 3"]:
@@ -245,7 +261,9 @@ def thin(points: Float64[np.ndarray, "points 3"], voxel_size: float) -> Float64[
 def _on_sphere(centre: tuple[float, float, float], radius: float, polar_deg: float, azimuth_deg: float) -> Pose:
     polar, azimuth = np.deg2rad(polar_deg), np.deg2rad(azimuth_deg)
     direction = np.array([np.sin(polar) * np.cos(azimuth), np.sin(polar) * np.sin(azimuth), np.cos(polar)])
-    return Pose.look_at(np.asarray(centre) + radius * direction, centre, [0.0, 0.0, 1.0])
+    # Straight above, the image's upper edge points where it does when the camera comes there from its azimuth.
+    up = [0.0, 0.0, 1.0] if polar_deg > 0 else [-np.cos(azimuth), -np.sin(azimuth), 0.0]
+    return Pose.look_at(np.asarray(centre) + radius * direction, centre, up)
 
 
 def _projection(camera: CameraIntrinsics) -> NDArray[np.float64]:
@@ -289,24 +307,19 @@ def _fuse(depths: Sequence[NDArray[np.float32]], cameras: Sequence[Pose]) -> NDA
     return np.asarray(volume.extract_point_cloud().points, dtype=np.float64).reshape(-1, 3)
 
 
-def check_sensing(preset: Preset, noise: Noise) -> None:
-    """Load what a camera and its noise need beyond the extra `sim`.
+def check_sensing(preset: Preset, sensor: Sensor) -> None:
+    """Load what a camera and its sensor need beyond the extra `sim`.
 
     Raises:
         MissingExtra: it is not installed; the message names the extra that brings it.
     """
     if preset in FUSED:
         _open3d()
-    if noise.dex:
-        _ndimage()
+    if sensor.depth:
+        ndimage()
 
 
 def _open3d() -> Any:
     # 400 MB and system libraries that single views do without, hence not at the top.
     with from_extra("fusion", "a camera whose views are fused needs"):
         return importlib.import_module("open3d")
-
-
-def _ndimage() -> Any:
-    with from_extra("sensors", "the noise of camera giga (--dex-noise) needs"):
-        return importlib.import_module("scipy.ndimage")

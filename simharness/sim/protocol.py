@@ -7,8 +7,7 @@ from __future__ import annotations
 
 import numpy as np
 
-from simharness.sim.camera import Observation
-from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT
+from simharness.sim.camera import Observation, perception_box
 from tesnet.geometry import PANDA, Gripper
 from tesnet.query import GraspQuery
 
@@ -19,8 +18,8 @@ def query_about(observation: Observation, seed: int = 0, gripper: Gripper = PAND
         observation.points_world,
         viewpoints=observation.viewpoints,
         up=np.array([0.0, 0.0, 1.0]),
-        workspace=PERCEPTION_BOX,
-        support_height=TABLE_HEIGHT,
+        workspace=perception_box(observation.table_height),
+        support_height=observation.table_height,
         gripper=gripper,
         seed=seed,
     )

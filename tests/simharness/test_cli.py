@@ -69,6 +69,7 @@ def test_ctrl_c_ends_cleanly_and_leaves_no_process(start_stub: Any, tmp_path: Pa
         ("open3d", "fusion", ["--camera", "multi3"]),
         ("scipy.ndimage", "sensors", ["--camera", "giga"]),
         ("scipy.ndimage", "sensors", ["--dex-noise"]),
+        ("scipy.ndimage", "sensors", ["--sensor", "d435"]),
         ("viser", "watch", ["--watch"]),
     ],
 )
@@ -91,7 +92,7 @@ def test_an_option_whose_extra_is_missing_names_it_before_anything_is_played(
         (["--camera", "fisheye"], "invalid choice"),
         (["--noise-std", "-1"], "out of range"),
         (["--noise-std", "nan"], "out of range"),
-        (["--polar-deg", "90"], "more than 0 and less than 90"),
+        (["--polar-deg", "90"], "0 or more and less than 90"),
         (["--voxel-size", "0"], "out of range"),
         (["failures", "nowhere"], "holds no run"),
         (["robustness", "--camera", "giga"], "unrecognized"),

@@ -10,13 +10,15 @@ from simharness.play.records import RoundRecord
 from simharness.play.round import (
     Attempted,
     Observed,
-    camera_noise,
     camera_rng,
+    camera_sensor,
     play_round,
     request_seed,
     scene_rng,
 )
 from simharness.sim.objects import ObjectModel
+from simharness.sim.sensors.catalogue import SENSORS
+from simharness.sim.sensors.gaussian import DepthGaussian
 from tests.simharness.planners import Alternating, Scripted, TopDown
 
 pytestmark = pytest.mark.sim
@@ -121,10 +123,10 @@ def test_random_numbers_depend_on_seed_round_and_observation_alone() -> None:
 
 
 def test_the_cameras_noise_can_be_replaced(make_settings: Any) -> None:
-    assert camera_noise(make_settings()).point_sigma == 0.0008
-    assert camera_noise(make_settings(noise_std=0.002)).point_sigma == 0.002
-    assert camera_noise(make_settings(camera="giga", noise_std=0.0)).dex
-    assert camera_noise(make_settings(depth_noise_std=0.001)).depth_sigma == 0.001
+    assert camera_sensor(make_settings()).point_sigma == 0.0008
+    assert camera_sensor(make_settings(noise_std=0.002)).point_sigma == 0.002
+    assert camera_sensor(make_settings(camera="giga", noise_std=0.0)) == SENSORS["dex"]
+    assert camera_sensor(make_settings(depth_noise_std=0.001)).depth == (DepthGaussian(0.001),)
 
 
 def test_failures_end_a_round_only_in_a_row(objects: tuple[ObjectModel, ...], make_settings: Any) -> None:

@@ -15,11 +15,12 @@ from simharness.play.folder import RunFolder
 from simharness.play.records import ModelRecord, Serving
 from simharness.play.round import Attempted, Observed, Plan, play_round
 from simharness.report.causes import examine, failures, failures_report, failures_table, place_of
-from simharness.sim.camera import Noise, Observation, observe_from
+from simharness.sim.camera import Observation, observe_from
 from simharness.sim.execute import Grip, Outcome
 from simharness.sim.hand import HandContact
 from simharness.sim.objects import load_object_set
 from simharness.sim.scene import TABLE_HEIGHT, restore_scene
+from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
 from tesnet.geometry import Pose
 
@@ -38,7 +39,7 @@ def seen() -> Iterator[tuple[Observation, int, int]]:
             for y in (FRONT, BACK)
         )
         camera = Pose.look_at([0.15, -0.5, 0.2], [0.15, 0.15, 0.1], [0.0, 0.0, 1.0])
-        yield observe_from(world, [camera], np.random.default_rng(0), Noise(), segmentation=True), front, back
+        yield observe_from(world, [camera], np.random.default_rng(0), Sensor(), segmentation=True), front, back
 
 
 def test_a_position_is_told_by_what_the_camera_saw_of_it(seen: tuple[Observation, int, int]) -> None:

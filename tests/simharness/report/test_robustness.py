@@ -12,9 +12,10 @@ import pytest
 from simharness.__main__ import main
 from simharness.errors import UsageError
 from simharness.play.records import ModelRecord, Run
-from simharness.play.round import camera_noise
+from simharness.play.round import camera_sensor
 from simharness.play.settings import RunSettings
 from simharness.report.robustness import AXES, AXIS_NAMES, Condition, Study, conditions
+from simharness.sim.sensors.catalogue import SENSORS
 
 MODEL = ModelRecord("tesnet", "1.2", "ab" * 32)
 
@@ -27,13 +28,15 @@ def finished(settings: RunSettings, make_round: Any, model: ModelRecord = MODEL)
 def test_every_condition_changes_what_it_says_and_no_scene(make_settings: Any) -> None:
     base = make_settings()
     found = {condition.name: condition.settings(base) for condition in conditions(AXIS_NAMES)}
-    assert len(found) == sum(len(axis.levels) for axis in AXES.values()) - 1  # two axes share the unchanged run
+    # Three axes share the unchanged run, two of them those without noise and with giga's.
+    assert len(found) == sum(len(axis.levels) for axis in AXES.values()) - 4
     assert found["unchanged"] == base
-    assert camera_noise(found["unchanged"]).point_sigma == 0.0008
-    assert camera_noise(found["noise-4mm"]).point_sigma == 0.004
-    giga = camera_noise(found["noise-giga"])
-    assert (giga.dex, giga.point_sigma) == (True, 0.0)
+    assert camera_sensor(found["unchanged"]).point_sigma == 0.0008
+    assert camera_sensor(found["noise-4mm"]).point_sigma == 0.004
+    assert camera_sensor(found["noise-giga"]) == SENSORS["dex"]
     assert found["polar-75deg"].polar_deg == 75
+    assert (found["d415-distance-500mm"].distance, found["d415-distance-500mm"].sensor) == (0.5, "d415")
+    assert not any(name.startswith("d415-distance-3") for name in found)
     assert found["voxel-5mm"].voxel_size == 0.005
     for settings in found.values():
         assert (settings.seeds, settings.scene, settings.objects) == (base.seeds, base.scene, base.objects)
@@ -60,7 +63,8 @@ def test_a_study_that_was_broken_off_says_so(make_settings: Any, make_round: Any
     study.add(first, finished(first.settings(make_settings()), make_round))
     assert study.report({})["complete"] is False
     assert f"Incomplete: 1 of {len(conditions(AXIS_NAMES))} conditions." in study.table()
-    assert len(ET.fromstring(study.plot()).findall(".//{*}circle/{*}title")) == 2
+    holding = sum(first.name in (level.name for level in axis.levels) for axis in AXES.values())
+    assert len(ET.fromstring(study.plot()).findall(".//{*}circle/{*}title")) == 2 * holding
 
 
 def test_runs_of_two_models_are_not_compared(make_settings: Any, make_round: Any) -> None:

@@ -12,15 +12,20 @@ from simharness.sim.camera import (
     INTRINSICS,
     NEAR,
     PRESETS,
-    Noise,
     Preset,
-    add_depth_noise,
+    Stand,
     observe,
+    observe_from,
+    perception_box,
     render,
     sample_camera,
     thin,
 )
 from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT, restore_scene
+from simharness.sim.sensors.calibration import Calibration
+from simharness.sim.sensors.catalogue import SENSORS
+from simharness.sim.sensors.gaussian import DepthGaussian
+from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
 
 pytestmark = pytest.mark.sim
@@ -69,12 +74,12 @@ def test_colour_and_segmentation_show_the_same_body(world: World) -> None:
 def test_no_noise_lifts_the_table_into_the_cloud() -> None:
     with World() as world:
         restore_scene(world, {"kind": "packed", "objects": []}, {})
-        observation = observe(world, "random", np.random.default_rng(0), Noise(point_sigma=0.003))
+        observation = observe(world, "random", np.random.default_rng(0), Sensor(point_sigma=0.003))
         assert observation.points_world.shape == (0, 3)
 
 
 def test_point_noise_has_its_size_and_comes_after_the_crop(world: World) -> None:
-    clean = observe(world, "random", np.random.default_rng(4), Noise())
+    clean = observe(world, "random", np.random.default_rng(4), Sensor())
     noisy = observe(world, "random", np.random.default_rng(4))
     assert (clean.points_world >= PERCEPTION_BOX.minimum.astype(np.float32)).all()
     difference = noisy.points_world - clean.points_world
@@ -91,16 +96,16 @@ def test_the_same_seed_gives_the_same_observation(world: World) -> None:
 def test_sensor_noise_leaves_empty_pixels_empty() -> None:
     depth = np.full((480, 640), 0.7, dtype=np.float32)
     depth[:, :100] = 0.0
-    noisy = add_depth_noise(depth, Noise(dex=True), np.random.default_rng(0))
+    noisy = SENSORS["dex"].measure(depth, INTRINSICS, np.random.default_rng(0))
     assert (noisy[:, :100] == 0).all()
     assert 0.002 < noisy[:, 100:].std() < 0.006
     # Neighbours err together.
     assert np.abs(np.diff(noisy[:, 100:], axis=1)).mean() < 0.5 * noisy[:, 100:].std()
-    noisy = add_depth_noise(depth, Noise(depth_sigma=0.001), np.random.default_rng(0))
+    noisy = Sensor((DepthGaussian(0.001),)).measure(depth, INTRINSICS, np.random.default_rng(0))
     assert noisy[:, 100:].std() == pytest.approx(0.001, rel=0.05)
 
 
-@pytest.mark.parametrize(("preset", "views"), [("random", 1), ("giga", 1), ("multi3", 3), ("vgn6", 6)])
+@pytest.mark.parametrize(("preset", "views"), [("random", 1), ("giga", 1), ("multi3", 3), ("vgn6", 6), ("top", 1)])
 def test_every_preset_looks_at_the_workspace_from_where_the_protocol_says(preset: Preset, views: int) -> None:
     cameras = sample_camera(preset, np.random.default_rng(2))
     assert len(cameras) == views
@@ -115,7 +120,7 @@ def test_every_preset_looks_at_the_workspace_from_where_the_protocol_says(preset
 
 def test_another_polar_angle_leaves_the_rest_of_the_view_as_it_was() -> None:
     def view(polar_deg: float | None) -> tuple[float, float, float]:
-        (camera,) = sample_camera("random", np.random.default_rng(3), polar_deg)
+        (camera,) = sample_camera("random", np.random.default_rng(3), Stand(polar_deg))
         away = camera.translation - [0.15, 0.15, 0.25]
         radius = float(np.linalg.norm(away))
         return radius, float(np.arctan2(away[1], away[0])), float(np.rad2deg(np.arccos(away[2] / radius)))
@@ -135,7 +140,7 @@ def test_a_thinned_cloud_keeps_the_mean_of_each_voxel() -> None:
 
 @pytest.mark.needs("open3d")
 def test_fused_views_show_every_side_of_the_box(world: World) -> None:
-    observation = observe(world, "multi3", np.random.default_rng(0), Noise())
+    observation = observe(world, "multi3", np.random.default_rng(0), Sensor())
     points = observation.points_world.astype(np.float64)
     assert observation.viewpoints.shape == (3, 3)
     distances = np.abs(np.abs(points - [0.15, 0.15, TOP - 0.04]) - [0.02, 0.03, 0.04]).min(axis=1)
@@ -150,9 +155,64 @@ def test_an_unknown_preset_is_refused_with_the_valid_ones() -> None:
         sample_camera("vgn7", np.random.default_rng(0))  # type: ignore[arg-type]
 
 
-def test_dex_noise_leaves_the_mean_depth_as_it_is() -> None:
-    rng = np.random.default_rng(0)
-    flat = np.full((8, 8), 0.6, dtype=np.float32)
-    means = [float(add_depth_noise(flat, Noise(dex=True), rng).mean()) for _ in range(800)]
-    assert np.mean(means) == pytest.approx(0.6, abs=0.003)
-    assert np.std(means) == pytest.approx(0.6 * np.sqrt(1000) * 0.001, rel=0.2)
+def test_a_camera_straight_above_sees_the_table_middle_in_the_image_middle() -> None:
+    (camera,) = sample_camera("top", np.random.default_rng(0))
+    assert camera.translation == pytest.approx([0.15, 0.15, TABLE_HEIGHT + 0.6])
+    np.testing.assert_allclose(camera.rotation[:, 2], [0.0, 0.0, -1.0], atol=1e-12)
+    # Its image is turned like that of a camera that nearly stands there.
+    (near,) = sample_camera("top", np.random.default_rng(0), Stand(polar_deg=0.01))
+    np.testing.assert_allclose(near.rotation, camera.rotation, atol=1e-3)
+
+
+@pytest.mark.parametrize("preset", PRESETS)
+def test_every_camera_can_be_put_at_any_distance_and_angle_to_the_table(preset: Preset) -> None:
+    for polar_deg, distance in ((0.0, 0.35), (80.0, 1.2)):
+        for camera in sample_camera(preset, np.random.default_rng(1), Stand(polar_deg, distance)):
+            away = camera.translation - [0.15, 0.15, TABLE_HEIGHT]
+            assert np.linalg.norm(away) == pytest.approx(distance)
+            assert np.rad2deg(np.arccos(away[2] / distance)) == pytest.approx(polar_deg, abs=1e-5)
+            np.testing.assert_allclose(camera.inverse().apply([0.15, 0.15, TABLE_HEIGHT]), [0, 0, distance], atol=1e-9)
+
+
+def test_a_wrong_calibration_moves_the_cloud_and_what_the_planner_believes_but_not_the_truth(world: World) -> None:
+    (camera,) = sample_camera("giga", np.random.default_rng(0))
+    wrong = Calibration(translation=0.005, rotation_deg=1.0, exact=True)
+    true = observe_from(world, [camera], np.random.default_rng(0), Sensor())
+    shown = observe_from(world, [camera], np.random.default_rng(0), Sensor(calibration=wrong))
+    believed = wrong.believed_pose(camera, np.random.default_rng(0))
+    np.testing.assert_allclose(shown.viewpoints[0], believed.translation)
+    np.testing.assert_array_equal(shown.Ts_world_camera, true.Ts_world_camera)
+    top = true.points_world[true.points_world[:, 2] > TOP - 1e-4].astype(np.float64)
+    moved = believed.apply(camera.inverse().apply(top))
+    inside = (moved > PERCEPTION_BOX.minimum + 1e-3).all(axis=1)
+    gap = np.linalg.norm(moved[inside][:50, None] - shown.points_world[None], axis=2).min(axis=1)
+    assert gap.max() < 1e-6
+    assert np.linalg.norm(moved - top, axis=1).min() > 0.002
+
+
+def test_a_wrong_depth_scale_moves_points_along_their_rays_and_a_wrong_table_height_moves_the_crop(
+    world: World,
+) -> None:
+    (camera,) = sample_camera("top", np.random.default_rng(0))
+    scaled = Sensor(calibration=Calibration(depth_scale=0.02, exact=True))
+    heights = {
+        round(float(observe_from(world, [camera], np.random.default_rng(seed), scaled).points_world[:, 2].max()), 4)
+        for seed in range(8)
+    }
+    distance = camera.translation[2] - TOP
+    assert heights == {round(camera.translation[2] - distance * factor, 4) for factor in (0.98, 1.02)}
+    raised = Sensor(calibration=Calibration(table_height=0.004, exact=True))
+    seen = [observe_from(world, [camera], np.random.default_rng(seed), raised) for seed in range(8)]
+    assert {round(observation.table_height - TABLE_HEIGHT, 6) for observation in seen} == {-0.004, 0.004}
+    lowered = perception_box(TABLE_HEIGHT - 0.004)
+    assert lowered.minimum[2] == pytest.approx(PERCEPTION_BOX.minimum[2] - 0.004)
+    np.testing.assert_array_equal(lowered.maximum, PERCEPTION_BOX.maximum)
+
+
+def test_with_the_table_in_view_the_cloud_holds_it_and_all_that_was_shown_without(world: World) -> None:
+    (camera,) = sample_camera("giga", np.random.default_rng(0))
+    alone = observe_from(world, [camera], np.random.default_rng(0), Sensor()).points_world
+    whole = observe_from(world, [camera], np.random.default_rng(0), Sensor(), table_in_view=True).points_world
+    assert (np.abs(whole[:, 2] - TABLE_HEIGHT) < 1e-5).sum() > 10_000
+    inside = ((whole >= PERCEPTION_BOX.minimum) & (whole <= PERCEPTION_BOX.maximum)).all(axis=1)
+    np.testing.assert_array_equal(whole[inside], alone)
