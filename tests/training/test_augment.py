@@ -45,6 +45,16 @@ def test_a_network_of_invariants_scores_what_withholds_nothing_the_same() -> Non
     assert unchanged >= 4
 
 
+def test_lines_of_sight_still_lead_to_the_viewpoint_that_saw_the_point() -> None:
+    for seed in range(3):
+        before, after = VIEW.cloud, turned(seed).cloud
+        to_viewpoint = torch.nn.functional.normalize(after.viewpoints[0] - after.points, dim=1)
+        torch.testing.assert_close(after.view_directions, to_viewpoint, atol=1e-5, rtol=0)
+        facing = [(cloud.normals * cloud.view_directions).sum(dim=1) for cloud in (before, after)]
+        torch.testing.assert_close(*facing, atol=1e-5, rtol=0)
+        assert (after.view_directions - before.view_directions).abs().max() > 0.1
+
+
 def test_the_sides_turn_with_the_cloud() -> None:
     before, after = (
         outside(view.cloud, view.candidates.Ts_canonical_grasp[:, :3, 3])

@@ -10,7 +10,7 @@ import torch
 
 from tesnet import candidates, cloud
 from tesnet.candidates import Candidates
-from tesnet.networks.tesnet import CloudFeatures, edge_features, point_inputs
+from tesnet.networks.tesnet import CloudFeatures, _candidate_inputs, _probe_inputs, edge_features, point_inputs
 from tests.tesnet.scenes import CAMERA, ask, fresh_network, prepared, tabletop, tabletop_query
 
 
@@ -112,12 +112,53 @@ def test_an_empty_region_pools_to_nothing() -> None:
     assert not pooled.any()
 
 
-def test_a_mirrored_scene_scores_as_the_mirror_option_says() -> None:
-    """Reflecting everything in the hand's plane, which holds y and z, changes the sign of x in the grasp frame."""
+def reflected(ready: cloud.PreparedCloud, centre: torch.Tensor, across: torch.Tensor) -> cloud.PreparedCloud:
+    """A cloud without sides, reflected in the plane through `centre` (3,) perpendicular to `across` (3,)."""
+    assert ready.up is not None
+    assert ready.support_height is not None
+    up = reflect(ready.up, across)
+    return replace(
+        ready,
+        points=reflect(ready.points - centre, across) + centre,
+        normals=reflect(ready.normals, across),
+        view_directions=reflect(ready.view_directions, across),
+        viewpoints=reflect(ready.viewpoints - centre, across) + centre,
+        up=up,
+        support_height=ready.support_height + float(centre @ (up - ready.up)),
+    )
+
+
+def reflect(directions: torch.Tensor, across: torch.Tensor) -> torch.Tensor:
+    """Directions (..., 3) with their part along the unit vector `across` (3,) turned about."""
+    return directions - 2 * (directions @ across)[..., None] * across
+
+
+def test_the_mirror_option_changes_scores_and_one_leaves_them() -> None:
     _, found = example()
     one = torch.ones(len(found))
     torch.testing.assert_close(score(found, one), score(found))
-    assert (score(found, -one) - score(found)).abs().max() > 1e-4
+    assert (score(found, -one) - score(found)).abs().median() > 1e-3
+
+
+def test_a_mirrored_candidate_sees_what_it_would_see_of_the_reflected_scene() -> None:
+    """The twin reflects cloud, normals, lines of sight, viewpoint, up and table in each hand's own plane."""
+    ready, found = example()
+    network = fresh_network()
+    few = found.select(torch.arange(0, len(found), 5))
+    totals, one = torch.zeros(len(few), 2), torch.ones(len(few))
+    pairs, hidden = [], []
+    for row in range(len(few)):
+        single = few.select(torch.tensor([row]))
+        pose = single.Ts_canonical_grasp
+        twin = reflected(ready, pose[0, :3, 3], pose[0, :3, 0])
+        pairs.append(_candidate_inputs(network.ends, twin, single, totals[:1], one[:1]))
+        hidden.append(_probe_inputs(network.probes, twin, pose, one[:1]))
+    seen = [_candidate_inputs(network.ends, ready, few, totals, sign * one) for sign in (-1, 1)]
+    torch.testing.assert_close(seen[0], torch.cat(pairs), atol=1e-4, rtol=0)
+    assert ((seen[0] - seen[1]).abs() > 1e-3).any(dim=1).all()
+    # The pixels of what was seen lie otherwise in the reflected scene.
+    mirrored, plain = (_probe_inputs(network.probes, ready, few.Ts_canonical_grasp, sign * one) for sign in (-1, 1))
+    assert (mirrored - torch.cat(hidden)).abs().mean() < 0.3 * (plain - torch.cat(hidden)).abs().mean()
 
 
 def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
