@@ -2,7 +2,7 @@ from __future__ import annotations
 
 import json
 import math
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from types import SimpleNamespace
 from typing import Any
@@ -13,6 +13,7 @@ import torch
 
 from tesnet import networks, weights
 from tesnet.candidates import Candidates
+from tesnet.cloud import PreparedCloud
 from tesnet.predictor import GraspPredictor
 from tests.tesnet.scenes import tabletop_query
 from tests.training.synthetic import labelled_view, write
@@ -21,7 +22,10 @@ from training import fit as fitting
 from training import metrics
 from training.evaluate import evaluate
 from training.fit import PRESETS, Recipe, fit
-from training.views import LabelsError, load_views
+from training.views import LabelledView, LabelsError, load_views
+
+Shown = tuple[PreparedCloud, Candidates, torch.Tensor]
+"""A cloud, candidates of it and which of them are mirrored."""
 
 RECIPE = Recipe(max_epochs=2, views_per_step=2, candidates_per_view=30)
 
@@ -119,6 +123,148 @@ def test_a_comparison_keeps_the_last_epoch_and_measures_all_candidates(
         assert training["validation_with_blocked"]["candidates"] == 60
     assert PRESETS["comparison"].keep == "last"
     assert PRESETS["comparison"].blocked_per_view > 0
+
+
+@pytest.mark.parametrize("stopped", [False, True])
+@pytest.mark.parametrize(("keep", "epoch"), [("best", 2), ("last", 4)])
+def test_the_weights_kept_are_those_of_the_epoch_they_are_named_after(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, keep: Any, epoch: int, stopped: bool
+) -> None:
+    """Every epoch changes the network; what it was when its validation loss was measured is noted."""
+    losses = iter([0.5, 0.3, 0.6, 0.4])
+    seen: list[dict[str, torch.Tensor]] = []
+
+    def measured(network: torch.nn.Module, *_: Any) -> Any:
+        seen.append({name: tensor.clone() for name, tensor in network.state_dict().items()})
+        return {"served_loss": next(losses), "calibration": [float(len(seen)), 0.0]}, {}
+
+    monkeypatch.setattr(fitting, "validate", measured)
+    monkeypatch.setattr(fitting, "_view_loss", lambda network, *_: sum(p.square().sum() for p in network.parameters()))
+    recipe = replace(RECIPE, max_epochs=4, keep=keep, learning_rate=1e-2, cosine=False)
+    for epochs in (2, None) if stopped else (None,):
+        run(folder, tmp_path / "a.safetensors", recipe, epochs=epochs)
+    state, header = weights.load(tmp_path / "a.safetensors")
+    assert header.training["epoch"] == epoch
+    assert header.calibration == pytest.approx((epoch, 0.0))
+    assert header.configuration["preparation"] == asdict(networks.build("tesnet").preparation)
+    same = [all(torch.equal(tensor, state[name]) for name, tensor in then.items()) for then in seen]
+    assert same == [number == epoch for number in range(1, 5)]
+
+
+class Watched(torch.nn.Module):
+    """A network of one parameter that remembers which candidates it is shown, and how."""
+
+    def __init__(self) -> None:
+        super().__init__()
+        self.logit = torch.nn.Parameter(torch.zeros(()))
+        self.shown: list[Shown] = []
+
+    def encode_batch(self, clouds: list[PreparedCloud]) -> list[None]:
+        return [None] * len(clouds)
+
+    def score(self, features: None, cloud: PreparedCloud, candidates: Candidates, mirror: torch.Tensor) -> torch.Tensor:
+        self.shown.append((cloud, candidates, mirror))
+        return self.logit.expand(len(candidates))
+
+
+def watched_epochs(
+    views: list[LabelledView], recipe: Recipe, count: int, out: Path, seed: int = 0
+) -> list[list[Shown]]:
+    """What a network was shown in each of `count` epochs."""
+    network, progress = Watched(), fitting._Progress({}, seed, recipe.learning_rate)
+    epochs = []
+    for _ in range(count):
+        optimiser = torch.optim.SGD(network.parameters(), lr=recipe.learning_rate)
+        fitting._epoch(network, optimiser, recipe, views, 0.5, progress, None, out)  # type: ignore[arg-type]
+        epochs.append(network.shown)
+        network.shown = []
+    return epochs
+
+
+def test_every_epoch_shows_other_draws_and_a_seed_repeats_them(tmp_path: Path) -> None:
+    """Order of the views, their turns, the candidates drawn and which of them are mirrored."""
+    views = [labelled_view(seed) for seed in range(6)]
+    recipe = replace(RECIPE, candidates_per_view=20)
+    first, second = watched_epochs(views, recipe, 2, tmp_path / "a.checkpoint")
+    again, _ = watched_epochs(views, recipe, 2, tmp_path / "a.checkpoint")
+    other, _ = watched_epochs(views, recipe, 2, tmp_path / "a.checkpoint", seed=1)
+
+    def order(shown: list[Shown]) -> list[int]:
+        sizes = [len(view.cloud) for view in views]
+        return [sizes.index(len(cloud)) for cloud, _, _ in shown]
+
+    def of_view(shown: list[Shown], index: int) -> tuple[torch.Tensor, ...]:
+        cloud, found, mirror = shown[order(shown).index(index)]
+        pairs = torch.stack([found.approach, found.contact], dim=1)
+        return cloud.points, torch.unique(pairs, dim=0), mirror
+
+    assert sorted(order(first)) == sorted(order(second)) == list(range(6))
+    assert order(first) != order(second)
+    assert order(first) == order(again)
+    for index in range(6):
+        for one, two, three, four in zip(
+            *(of_view(shown, index) for shown in (first, second, again, other)), strict=True
+        ):
+            assert torch.equal(one, three)
+            assert not torch.equal(one, two)
+            assert not torch.equal(one, four)
+        assert set(of_view(first, index)[2].tolist()) == {-1.0, 1.0}
+    # Nor do two views of an epoch share their draws.
+    mirrors = [tuple(mirror.tolist()) for _, _, mirror in first]
+    assert len(set(mirrors)) == len(mirrors)
+
+
+@pytest.mark.parametrize("approach_points", [None, 1000])
+@pytest.mark.parametrize(("free", "blocked"), [(20, 10), (20, 0), (100, 100)])
+def test_free_and_blocked_candidates_are_shown_in_the_numbers_of_the_recipe(
+    free: int, blocked: int, approach_points: int | None
+) -> None:
+    view = labelled_view(count=60)
+    view = replace(view, collision_free=torch.arange(60) % 2 == 0)
+    is_free = dict(
+        zip(zip(view.approach.tolist(), view.contact.tolist(), strict=True), view.collision_free, strict=True)
+    )
+    assert len(is_free) == 60
+    network = Watched()
+    recipe = replace(RECIPE, candidates_per_view=free, blocked_per_view=blocked)
+    fitting._view_loss(network, view, 0.0, recipe, np.random.default_rng(0), approach_points)  # type: ignore[arg-type]
+    ((_, found, _),) = network.shown
+    shown = [bool(is_free[pair]) for pair in zip(found.approach.tolist(), found.contact.tolist(), strict=True)]
+    assert (shown.count(True), shown.count(False)) == (min(free, 30), min(blocked, 30))
+
+
+def test_the_default_recipes_show_blocked_candidates_too() -> None:
+    assert all(PRESETS[name].blocked_per_view > 0 for name in ("default", "refine"))
+
+
+@pytest.mark.parametrize("cosine", [True, False])
+def test_the_optimiser_steps_at_the_rate_of_the_schedule(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch, cosine: bool
+) -> None:
+    """A slope of one moves a parameter by just the rate in each step of plain gradient descent."""
+    moving = torch.zeros((), requires_grad=True)
+    places: list[float] = []
+
+    def loss(*_: Any) -> torch.Tensor:
+        places.append(float(moving.detach()))
+        return moving * 1.0
+
+    monkeypatch.setattr(fitting, "_view_loss", loss)
+    monkeypatch.setattr(
+        fitting, "_optimiser", lambda network, recipe: torch.optim.SGD([moving], lr=recipe.learning_rate)
+    )
+    monkeypatch.setattr(fitting, "validate", lambda *_: ({"served_loss": 1.0, "calibration": [1.0, 0.0]}, {}))
+    recipe = replace(RECIPE, learning_rate=0.5, views_per_step=1, max_epochs=8, cosine=cosine, patience=2)
+    for epochs in (3, None):  # stopped and resumed
+        run(folder, tmp_path / "a.safetensors", recipe, epochs=epochs)
+    rates = -np.diff([*places, float(moving.detach())])
+    steps = np.arange(24)  # of three views, eight times
+    if cosine:
+        falling = np.maximum(0.03, (1 + np.cos(np.pi * steps / 24)) / 2)
+        expected = 0.5 * np.minimum(1, (steps + 1) / 100) * falling
+    else:  # the first epoch is better than none, then every second one halves
+        expected = 0.5 / 2.0 ** np.maximum(0, (steps // 3 - 1) // 2)
+    np.testing.assert_allclose(rates, expected, rtol=1e-4, atol=1e-6)
 
 
 def test_a_network_that_learns_nothing_is_refused(folder: Path, tmp_path: Path) -> None:
