@@ -152,9 +152,9 @@ class GraspOptions(RequestPart):
     )
     up: Vector | Literal["auto"] | None = Field(
         default=None,
-        description="Direction [x, y, z] against gravity in the cloud frame, of any length. `auto` finds the plane that "
-        "things stand on, of several the one nearest the camera: its normal is up, its height the `support_height`, and "
-        "`warnings` gives the figures. Default: `auto` for a depth image; for a cloud none, so grasps from below are "
+        description="Direction [x, y, z] against gravity in the cloud frame, of any length. `auto` finds the plane "
+        "that things stand on, of several that with most in view: its normal is up, its height is `support_height`, "
+        "and `warnings` gives the figures. Default: `auto` for a depth image; for a cloud none, so grasps from below are "
         "not filtered, only those from behind what the camera sees, and `warnings` says so.",
     )
     workspace: Box | None = Field(
@@ -166,7 +166,8 @@ class GraspOptions(RequestPart):
         default=None,
         description="Height of the support plane along `up` in metres (needs `up`): points lower than 5 mm above it "
         "are dropped, and the hand stays 4 mm clear of it. `auto` finds the plane that things stand on, and "
-        "`warnings` says where; where no `target` is given, grasps are looked for on those things, up to 0.35 m above it. Default: none.",
+        "`warnings` says where; without a `target`, grasps are then looked for on those things alone, up to 0.35 m "
+        "above it. Default: none.",
     )
     target: Target | None = Field(
         default=None,

@@ -181,7 +181,7 @@ class Surfaces:
 
 
 def spread(cloud: NDArray[np.floating], most: int) -> NDArray[np.floating]:
-    """At most so many rows of a cloud, one in each stretch of its order, so that an image's rows and columns all count."""
+    """At most so many rows of a cloud, one in each stretch of its order; of an image, from all columns."""
     if len(cloud) <= most:
         return cloud
     step = len(cloud) / most
@@ -269,7 +269,7 @@ def radius(points: Array, up: Array) -> float:
 
 
 def outline(points: Array, up: Array) -> Array:
-    """(SIDES, 4): the sides of the narrowest prism along `up`, of so many evenly turned sides, that holds the points."""
+    """(SIDES, 4): the narrowest prism along `up`, of so many evenly turned sides, that holds the points."""
     angle = 2 * np.pi * np.arange(SIDES) / SIDES
     normals = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ basis(up)[:, :2].T
     return np.column_stack([normals, (points @ normals.T).max(axis=0)])
