@@ -19,8 +19,9 @@ SAMPLE = 8_000
 """Points that are looked at; of more, so many spread evenly over their order."""
 REACH = 10.0
 """Of the median; what is farther is none of the scene."""
-PATCH = 0.03
-"""Edge of the cells whose points make one local normal: wide against the noise of a depth camera."""
+PATCHES = (0.03, 0.06, 0.12)
+"""Edge of the cells whose points make one local normal: wide against the noise of a depth camera. The first is taken in
+which most points are in patches of twice the fewest points, or else the last."""
 FEWEST_OF_PATCH = 6
 FLAT = 0.25
 """A patch is flat where its least spread, as a standard deviation, is at most this share of the next."""
@@ -37,6 +38,8 @@ BANDS = (0.03, 0.01, 0.01)
 DEVIATIONS = 3.0
 """A plane's own points lie within so many standard deviations of its noise."""
 LEAST_BAND = 0.001
+MOST_TILT = np.cos(np.deg2rad(2.5))
+"""A plane across a given direction is tilted less than this."""
 LEAST_RADIUS = 1.5
 """A surface that bends more than this is no plane, but the floor of a bin, say."""
 SQUARE = 0.04
@@ -91,7 +94,10 @@ class Surfaces:
         """Those of a cloud (N, 3) with at least one point, within `REACH` of its median."""
         points = spread(cloud, SAMPLE).astype(np.float64)
         points = points[((points - np.median(points, axis=0)) ** 2).sum(axis=1) <= REACH**2]
-        _, patch_of, sizes = cells(points, PATCH)
+        for edge in PATCHES:
+            _, patch_of, sizes = cells(points, edge)
+            if np.median(sizes[patch_of]) >= 2 * FEWEST_OF_PATCH:
+                break
         counts = sizes.astype(np.float64)
         means = np.stack([np.bincount(patch_of, points[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
         deviations = points - means[patch_of]
@@ -139,8 +145,9 @@ class Surfaces:
     def planes_across(self, up: Array) -> Iterator[Plane]:
         """The planes whose normal is a unit direction (3,)."""
         for height, able, sure in self._heights(up, BANDS[-1]):
-            own = self._piece(up, able & (np.abs(self.points @ up - height) <= BANDS[-1]))
-            if own.sum() >= FEWEST_POINTS:
+            residuals = np.abs(self.points @ up - height)
+            own, wide = (self._piece(up, able & (residuals <= band)) for band in (BANDS[-1], BANDS[0]))
+            if own.sum() >= FEWEST_POINTS and least_squares(self.points[wide & sure], up)[0] @ up >= MOST_TILT:
                 yield from self._plane(up, float(np.median(self.points[own] @ up)), able, sure)
 
     def _heights(self, direction: Array, half: float) -> Iterator[tuple[float, Mask, Mask]]:
@@ -186,7 +193,8 @@ def spread(cloud: NDArray[np.floating], most: int) -> NDArray[np.floating]:
         return cloud
     step = len(cloud) / most
     number = np.arange(most)
-    return cloud[((number + (number * _GOLDEN) % 1.0) * step).astype(np.intp)]
+    rows: NDArray[np.floating] = cloud[((number + (number * _GOLDEN) % 1.0) * step).astype(np.intp)]
+    return rows
 
 
 def cells(points: Array, edge: float) -> tuple[Indices, Indices, Indices]:
@@ -277,5 +285,5 @@ def outline(points: Array, up: Array) -> Array:
 
 def within(points: NDArray[np.floating], sides: Array) -> Mask:
     """Mask (N,) of points (N, 3) inside all sides (S, 4)."""
-    inside: Mask = (points @ sides[:, :3].T.astype(points.dtype) <= sides[:, 3].astype(points.dtype)).all(axis=1)
+    inside: Mask = np.all(points @ sides[:, :3].T.astype(points.dtype) <= sides[:, 3].astype(points.dtype), axis=1)
     return inside

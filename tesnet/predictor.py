@@ -174,11 +174,11 @@ class GraspPredictor:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""
         clock = _Clock(give_up)
         rejected = dict.fromkeys(REJECTIONS, 0)
-        query, plane, found = support.settled(query)
-        notes = [*_query_warnings(query), *found, *_support_warnings(query)]
+        query, plane, said = support.settled(query)
+        notes = [*_query_warnings(query), *said, *_support_warnings(query)]
 
         clock.check()
-        prepared = cloud.prepare(query, self._preparation, self.device)
+        prepared = cloud.prepare(query, self._preparation, self.device, plane)
         self._synchronise()
         clock.lap("prepare")
         if prepared is not None:
@@ -460,8 +460,9 @@ def _cloud_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cl
         )
     if prepared.dropped_surplus:
         notes.append(
-            f"the cloud is large: {prepared.dropped_surplus} of its {config.voxel_size * 1000:g} mm cells, the "
-            f"farthest from its median, were ignored (limit {config.max_points}); set workspace to choose what matters"
+            f"the cloud is large: in {prepared.dropped_surplus} of its {config.voxel_size * 1000:g} mm cells, the "
+            f"farthest from its middle or, on a support that was found, from the camera, no grasps were looked for; "
+            f"set workspace or target to choose what matters"
         )
     return notes
 

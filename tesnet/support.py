@@ -53,22 +53,22 @@ class SupportPlane:
     noise_sd: float
     sides: Array
 
+    @property
+    def clearance(self) -> float:
+        """What is lower than this above it is the plane itself."""
+        return max(LOWEST, DEVIATIONS * self.noise_sd)
+
 
 def settled(query: GraspQuery) -> tuple[GraspQuery, SupportPlane | None, list[str]]:
-    """The query with what is "auto" in it found, or left out where there is no plane; the plane; notes for the caller.
-
-    Where the caller names no target, it becomes what stands on the plane.
-    """
+    """The query with what is "auto" in it found, or left out where there is no plane; that plane; and notes."""
     finds_up = isinstance(query.up, str)
     if not finds_up and query.support_height != "auto":
         return query, None, []
     plane = find(query)
     if plane is None:
         return replace(query, up=query.known_up, support_height=None), None, [_NO_UP if finds_up else _NO_HEIGHT]
-    things = region(query.points, plane) if query.target is None else None
-    target = things if things is not None and things.sum() >= _FEWEST else query.target
     note = _up_note(plane, query) if finds_up else f"support_height auto: {_figures(plane, query)}"
-    return replace(query, up=plane.up, support_height=plane.height, target=target), plane, [note]
+    return replace(query, up=plane.up, support_height=plane.height), plane, [note]
 
 
 _NO_UP = "up auto: no plane that things stand on was found, so none is kept clear and up is unknown: give up"
@@ -91,7 +91,7 @@ def _figures(plane: SupportPlane, query: GraspQuery) -> str:
 def region(points: NDArray[np.float32], plane: SupportPlane) -> Mask:
     """Mask (N,) of the points (N, 3) of what stands on a plane: above its noise, to 0.35 m, inside its outline."""
     heights = points @ plane.up.astype(points.dtype) - plane.height
-    rows = np.flatnonzero((heights > max(LOWEST, DEVIATIONS * plane.noise_sd)) & (heights <= HIGHEST))
+    rows = np.flatnonzero((heights > plane.clearance) & (heights <= HIGHEST))
     mask = np.zeros(len(points), dtype=bool)
     mask[rows[within(points[rows], plane.sides)]] = True
     return mask

@@ -32,5 +32,5 @@ class Box:
 
     def contains(self, points: NDArray[np.floating]) -> NDArray[np.bool_]:
         """Mask (N,) of the points (N, 3) that lie in it, its sides included."""
-        inside: NDArray[np.bool_] = ((points >= self.minimum) & (points <= self.maximum)).all(axis=1)
+        inside: NDArray[np.bool_] = np.all((points >= self.minimum) & (points <= self.maximum), axis=1)
         return inside

@@ -243,8 +243,8 @@ def test_options_arrive_in_the_query_and_defaults_are_the_library_s_own() -> Non
     query = build_query(Payload(points), parse_options(raw))
     assert query.viewpoints is not None
     assert query.viewpoints.tolist() == [[0, 0, 1], [1, 0, 1]]
-    assert query.up is not None
-    assert query.up.tolist() == [0, 0, 1]
+    assert query.known_up is not None
+    assert query.known_up.tolist() == [0, 0, 1]
     assert query.workspace is not None
     assert query.workspace.maximum.tolist() == [1, 2, 3]
     assert query.approach is not None

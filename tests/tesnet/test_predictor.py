@@ -176,7 +176,7 @@ def test_a_million_points_all_over_a_room_are_answered_with_a_warning() -> None:
     result = predictor().predict(query)
     assert_sound(result, query)
     assert result.counts.prepared_points <= 12_000
-    assert any("the cloud is large" in note and "set workspace" in note for note in result.warnings)
+    assert any("the cloud is large" in note and "set workspace or target" in note for note in result.warnings)
 
 
 # Warnings

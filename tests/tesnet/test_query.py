@@ -145,9 +145,9 @@ def test_a_query_copies_its_arrays_and_keeps_them_read_only() -> None:
     assert query.points.dtype == np.float32
     np.testing.assert_allclose(query.points, POINTS, atol=1e-7)
     assert query.viewpoints is not None
-    assert query.up is not None
+    assert query.known_up is not None
     np.testing.assert_array_equal(query.viewpoints, [[0, 0, 1]])
-    for array in (query.points, query.viewpoints, query.up):
+    for array in (query.points, query.viewpoints, query.known_up):
         with pytest.raises(ValueError, match="read-only"):
             array[:] = 0
 

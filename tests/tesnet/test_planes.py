@@ -1,0 +1,75 @@
+"""Planes are found where they were put, with the noise that was added, and moved with the cloud; bent ones are none."""
+
+from __future__ import annotations
+
+import numpy as np
+import pytest
+from numpy.typing import NDArray
+
+from tesnet import planes
+from tesnet.geometry import Pose
+
+Array = NDArray[np.float64]
+
+
+def square(size: float, count: int = 20_000, noise: float = 0.0, seed: int = 0) -> Array:
+    """Points (count, 3) of a square about the origin, across z."""
+    rng = np.random.default_rng(seed)
+    return np.column_stack([rng.uniform(-size / 2, size / 2, (count, 2)), rng.normal(0, noise, count)])
+
+
+def found(points: Array) -> list[planes.Plane]:
+    surfaces = planes.Surfaces.of(points)
+    return [plane for direction in surfaces.directions() for plane in surfaces.planes_near(direction)]
+
+
+@pytest.mark.parametrize("noise", [0.0005, 0.001, 0.003])
+def test_the_noise_that_is_measured_is_the_noise_that_was_added(noise: float) -> None:
+    (plane,) = found(square(0.6, noise=noise))
+    assert plane.noise_sd == pytest.approx(noise, rel=0.05)
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_a_plane_moves_with_its_points(seed: int) -> None:
+    motion = Pose.random(np.random.default_rng(seed), reach=2.0)
+    (plane,) = found(motion.apply(square(0.6, noise=0.001)))
+    up = motion.rotate(np.array([[0.0, 0.0, 1.0]]))[0]
+    assert abs(plane.up @ up) > np.cos(np.deg2rad(0.2))
+    assert plane.height * np.sign(plane.up @ up) == pytest.approx(motion.translation @ up, abs=0.002)
+
+
+def test_planes_of_a_corner_are_three() -> None:
+    turn = np.eye(3)[[1, 2, 0]]
+    corner = np.concatenate(
+        [(square(1.0) + np.array([0.5, 0.5, 0])) @ np.linalg.matrix_power(turn, k) for k in range(3)]
+    )
+    ups = np.abs([plane.up for plane in found(corner)])
+    assert sorted(map(tuple, ups.round(3))) == [(0, 0, 1), (0, 1, 0), (1, 0, 0)]
+
+
+@pytest.mark.parametrize("radius", [0.2, 0.5, 1.0])
+def test_a_bent_surface_is_no_plane(radius: float) -> None:
+    points = square(0.4)
+    points[:, 2] = radius - np.sqrt(radius**2 - points[:, 0] ** 2)
+    assert found(points) == []
+
+
+def test_pieces_hang_together_across_a_gap_of_one_square() -> None:
+    squares = np.array([[0, 0], [0, 2], [0, 5], [3, 0], [4, 1]])
+    assert planes.pieces(squares).tolist() == [0, 0, 2, 3, 3]
+
+
+def test_the_outline_holds_the_points_and_little_else() -> None:
+    points, up = square(0.4), np.array([0.0, 0.0, 1.0])
+    sides = planes.outline(points, up)
+    assert planes.within(points, sides + np.array([0, 0, 0, 1e-9])).all()
+    assert not planes.within(points * 1.05 + np.sign(points) * 0.012, sides)[
+        np.abs(points[:, :2]).max(axis=1) > 0.195
+    ].any()
+
+
+def test_the_spread_of_a_sample_is_even() -> None:
+    rows = planes.spread(np.arange(300_000.0)[:, None], 1000)[:, 0]
+    assert len(rows) == 1000
+    assert (np.floor(rows / 300) == np.arange(1000)).all()
+    assert len(np.unique(rows % 640)) > 300
