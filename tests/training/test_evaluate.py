@@ -2,6 +2,7 @@ from __future__ import annotations
 
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
@@ -12,8 +13,8 @@ from tesnet.predictor import configuration_of
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view, write
 from training import metrics
-from training.evaluate import evaluate, measure, score_views
-from training.views import LabelsError
+from training.evaluate import evaluate, measure, score_views, validate
+from training.views import LabelsError, load_views
 
 
 def test_views_are_scored_where_the_observed_cloud_leaves_them_free_unless_all_are_asked_for() -> None:
@@ -40,9 +41,49 @@ def test_the_calibration_is_fitted_to_every_other_view_and_judged_on_the_rest() 
     assert found["calibration"] == pytest.approx([a, b])
     assert found["served_loss"] == pytest.approx(metrics.cross_entropy(a * judged[0] + b, judged[1]))
     assert found["candidates"] == 320
-    given = measure(scored, seed=0, calibration=(1.0, 0.0))
-    everything = [np.concatenate([view[part] for view in scored]) for part in (0, 1)]
-    assert given["served_loss"] == pytest.approx(metrics.cross_entropy(*everything))
+    given = measure(scored, seed=0, calibration=(2.0, -0.7))
+    logits, success = (np.concatenate([view[part] for view in scored]) for part in (0, 1))
+    check_judged(given, logits, success, (2.0, -0.7))
+
+
+def check_judged(
+    found: dict[str, Any], logits: metrics.Logits, success: metrics.Success, calibration: tuple[float, float]
+) -> None:
+    """That error and loss are those of the score as it is served: sigmoid(a * logit + b)."""
+    a, b = calibration
+    assert found["calibration"] == pytest.approx([a, b])
+    served = 1 / (1 + np.exp(-(a * logits + b)))
+    loss = -np.mean(np.log(np.where(success, served, 1 - served)))
+    assert found["served_loss"] == pytest.approx(loss, abs=1e-4)
+    assert found["calibration_error"] == pytest.approx(metrics.calibration_error(served, success), abs=1e-3)
+
+
+def test_weights_are_judged_with_the_calibration_that_they_are_served_with(tmp_path: Path) -> None:
+    network = fresh_network()
+    header = weights.Header("tesnet", "1", configuration_of(network), (3.0, -0.7))
+    weights.save(tmp_path / "a.safetensors", network.state_dict(), header)
+    folder = write(tmp_path / "labels", [replace(labelled_view(0), collision_free=torch.arange(60) < 45)])
+    found = evaluate("tesnet", tmp_path / "a.safetensors", [folder])
+    views = list(load_views([folder], network.preparation))
+    for measures, blocked in ((found["all"], False), (found["with_blocked"]["all"], True)):
+        ((logits, success),) = score_views(network, views, blocked=blocked)
+        check_judged(measures, logits, success, (3.0, -0.7))
+
+
+def test_validation_judges_all_candidates_with_the_calibration_of_the_free_ones() -> None:
+    network = fresh_network()
+    views = [replace(labelled_view(seed), collision_free=torch.arange(60) < 45) for seed in range(3)]
+    for apart in ((), [labelled_view(3)]):
+        of_free, of_all = validate(network, views, 0, apart)
+        fitted_to = score_views(network, apart or views[::2])
+        a, b = metrics.fit_calibration(*(np.concatenate(parts) for parts in zip(*fitted_to, strict=True)))
+        for measures, judged, blocked in (
+            (of_free, views if apart else views[1::2], False),
+            (of_all, views, True),
+        ):
+            scored = score_views(network, judged, blocked=blocked)
+            logits, success = (np.concatenate(parts) for parts in zip(*scored, strict=True))
+            check_judged(measures, logits, success, (a, b))
 
 
 def test_measures_come_overall_by_scene_and_with_what_the_cloud_blocks(tmp_path: Path) -> None:
