@@ -9,9 +9,14 @@ import numpy as np
 import pytest
 import torch
 
-from tesnet.cloud import PreparationConfig
+from simharness.sim.protocol import query_about
+from tesnet import weights
+from tesnet.cloud import PreparationConfig, prepare
 from tesnet.collision import blocked
 from tesnet.geometry import PANDA
+from tesnet.predictor import GraspPredictor
+from tesnet.query import GraspQuery
+from training import archive
 from training.__main__ import main
 from training.archive import _draw, pack, unpack
 from training.generate import GenerateConfig, generate
@@ -105,6 +110,29 @@ def test_some_scenes_are_drawn_and_prepared_as_a_network_wants_them(labels: Path
     assert len(drawn) > 1
     with pytest.raises(LabelsError, match="prepared for another network"):
         unpack(tmp_path / "archive", "procedural-train", folders["coarse"], preparation=fine)
+
+
+def test_scenes_are_rendered_with_clouds_as_the_service_prepares_them(
+    labels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    queries: list[GraspQuery] = []
+
+    def noted(*arguments: Any) -> GraspQuery:
+        queries.append(query_about(*arguments))
+        return queries[-1]
+
+    monkeypatch.setattr(archive, "query_about", noted)
+    preparation = GraspPredictor.load(weights.default_weights()).preparation
+    description, views = archive._read_scene(next(path for path in scene_files([labels]) if load_scene(path)[1]))
+    job = archive._Rendering(description, views[:1], tmp_path / "scene_0.npz")
+    archive._render_scene(job, archive._models_by_kind("procedural-train")[description["kind"]], 0, preparation)
+    (view,) = load_scene(tmp_path / "scene_0.npz")[1]
+    served = prepare(queries[0], preparation, torch.device("cpu"))
+    assert served is not None
+    # As far as float16 keeps them.
+    torch.testing.assert_close(view.cloud.points, served.points, atol=3e-4, rtol=0)
+    torch.testing.assert_close(view.cloud.spectrum, served.spectrum, atol=3e-4, rtol=0)
+    assert (view.cloud.normals * served.normals).sum(dim=1).quantile(0.01) > 0.9999
 
 
 def test_shallow_pairs_come_back_straight_down(labels: Path, tmp_path: Path) -> None:

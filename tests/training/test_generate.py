@@ -3,12 +3,20 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
+import torch
 
 from simharness.sim.outcomes import OUTCOME_KINDS
+from simharness.sim.protocol import query_about
+from tesnet import weights
+from tesnet.cloud import prepare
 from tesnet.hands import HANDS
+from tesnet.predictor import GraspPredictor
+from tesnet.query import GraspQuery
+from training import generate as generating
 from training.archive import pack
 from training.generate import GenerateConfig, generate
 from training.views import LabelsError, load_scene, scene_files
@@ -65,6 +73,22 @@ def test_a_second_run_gives_equal_labels_and_a_longer_one_goes_on(labels: Path, 
     assert longer["scenes"] > account["scenes"]
     after = {path.name: path.stat().st_mtime_ns for path in scene_files([tmp_path / "second"])}
     assert {name: after[name] for name in before} == before
+
+
+def test_labels_show_the_clouds_as_the_service_prepares_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    """To the last bit, so that no network learns from normals of another neighbourhood than it is served."""
+    queries: list[GraspQuery] = []
+
+    def noted(*arguments: Any) -> GraspQuery:
+        queries.append(query_about(*arguments))
+        return queries[-1]
+
+    monkeypatch.setattr(generating, "query_about", noted)
+    _, (view,) = generating.label_scene(CONFIG, generating.object_sets(CONFIG), 0)
+    served = prepare(queries[0], GraspPredictor.load(weights.default_weights()).preparation, torch.device("cpu"))
+    assert served is not None
+    for name in ("points", "normals", "spectrum", "neighbours", "view_directions"):
+        assert torch.equal(getattr(view.cloud, name), getattr(served, name))
 
 
 def test_more_workers_make_the_same_scenes(labels: Path, tmp_path: Path) -> None:

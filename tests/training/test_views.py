@@ -16,7 +16,8 @@ from training.views import LabelsError, load_scene, load_views, pairs_of, save_s
 
 
 def test_labels_round_trip(tmp_path: Path) -> None:
-    first, second = labelled_view(0), labelled_view(1, count=40)
+    first = replace(labelled_view(0), collision_free=torch.arange(60) % 3 > 0)
+    second = labelled_view(1, count=40)
     path = tmp_path / "scene_0000000.npz"
     save_scene(path, {"seed": 3, "objects": ["a", "b"]}, [first, second])
     description, views = load_scene(path)
@@ -123,4 +124,13 @@ def test_clouds_of_another_preparation_are_refused(tmp_path: Path) -> None:
     save_scene(tmp_path / "scene_0.npz", {}, [labelled_view(count=30)], fine)
     assert len(list(load_views([tmp_path], fine))) == 1
     with pytest.raises(LabelsError, match=r"voxel_size is 0\.0025, not 0\.0045\); .*unpack --model NAME"):
+        list(load_views([tmp_path], PreparationConfig()))
+
+
+@pytest.mark.parametrize("name", asdict(PreparationConfig()))
+def test_clouds_that_differ_in_any_part_of_their_preparation_are_refused(tmp_path: Path, name: str) -> None:
+    """Such as normals of 16 neighbours, where the service fits them to 14."""
+    value = asdict(PreparationConfig())[name]
+    save_scene(tmp_path / "scene_0.npz", {}, [labelled_view(count=30)], PreparationConfig(**{name: value + 2}))
+    with pytest.raises(LabelsError, match=f"{name} is {value + 2}, not {value}"):
         list(load_views([tmp_path], PreparationConfig()))
