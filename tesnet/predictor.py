@@ -437,7 +437,9 @@ def _answer_warnings(best: float, prepared: cloud.PreparedCloud, query: GraspQue
 
 def _point_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
     points = prepared.points
-    spacing = float((points - points[prepared.neighbours[:, 1]]).norm(dim=1).median())
+    # A network that uses no graph asks for no neighbours but the point itself.
+    neighbours = prepared.neighbours if config.graph_neighbours > 1 else cloud.nearest_neighbours(points, 2)
+    spacing = float((points - points[neighbours[:, 1]]).norm(dim=1).median())
     notes = plausibility.cloud_notes(points.cpu().numpy(), spacing, config.voxel_size)
     if query.viewpoints is not None:
         enclosed = (plausibility.enclosed_viewpoint(query.points, viewpoint) for viewpoint in query.viewpoints)
