@@ -15,6 +15,7 @@ from tesnet import candidates, cloud, collision, networks, plausibility, ranking
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box, GraspSet, Pose
 from tesnet.networks import Network
+from tesnet.points import nearest_neighbours
 from tesnet.query import MAX_SEED, NO_VIEWPOINT, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 
@@ -438,7 +439,7 @@ def _answer_warnings(best: float, prepared: cloud.PreparedCloud, query: GraspQue
 def _point_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
     points = prepared.points
     # A network that uses no graph asks for no neighbours but the point itself.
-    neighbours = prepared.neighbours if config.graph_neighbours > 1 else cloud.nearest_neighbours(points, 2)
+    neighbours = prepared.neighbours if config.graph_neighbours > 1 else nearest_neighbours(points, 2)
     spacing = float((points - points[neighbours[:, 1]]).norm(dim=1).median())
     notes = plausibility.cloud_notes(points.cpu().numpy(), spacing, config.voxel_size)
     if query.viewpoints is not None:
