@@ -22,7 +22,7 @@ from PIL import Image
 from bench.rooms import DEPTH_SCALE, SIZES, RoomFrame, Truth, frames
 from bench.serve import running_service
 from bench.solids import Array
-from client import GraspClient, GraspReply
+from client import GraspClient, GraspReply, ProblemError
 from client.request import GraspOptions
 from simharness.play.server import free_port
 from tesnet.geometry import PANDA, CameraIntrinsics, Gripper, Pose
@@ -32,7 +32,9 @@ HELD_POINTS = 10
 """A hand at the grasp holds what was seen where so many posted points lie so deep in it."""
 LOWEST, HIGHEST = 0.003, 0.35
 """Above the surface: where both the approach point and the contact point of a grasp on its things lie, metres."""
-CAMERA = ("intrinsics", "T_cloud_camera", "depth_scale")
+CAMERA = ("intrinsics", "T_cloud_camera", "depth_scale", "stride")
+MOST_PIXELS = 1_000_000
+"""Frames of more, which would be over a service's limit of points, are sent with a stride of 2."""
 _READY_WITHIN_S = 120.0
 
 
@@ -54,7 +56,9 @@ class Frame:
 
     def bare(self) -> Frame:
         """The same with nothing but its camera."""
-        camera = {name: value for name, value in self.options.items() if name in ("intrinsics", "depth_scale")}
+        camera = {
+            name: value for name, value in self.options.items() if name in ("intrinsics", "depth_scale", "stride")
+        }
         return Frame(self.name, self.depth, camera, self.truth)
 
 
@@ -120,6 +124,7 @@ def write_frames(folder: Path, named: Iterator[tuple[str, RoomFrame]]) -> None:
         options = {
             "intrinsics": {"fx": k.fx, "fy": k.fy, "cx": k.cx, "cy": k.cy},
             "depth_scale": DEPTH_SCALE,
+            "stride": 1 if frame.counts.size <= MOST_PIXELS else 2,
             "up": truth.up.tolist(),
             "support_height": "auto",
             "truth": {"up": truth.up.tolist(), "height": truth.height, "outline": truth.outline.tolist()},
@@ -135,6 +140,7 @@ def ask(client: GraspClient, frame: Frame) -> GraspReply:
         intrinsics=frame.options["intrinsics"],
         T_cloud_camera=frame.options.get("T_cloud_camera"),
         depth_scale=frame.options.get("depth_scale", DEPTH_SCALE),
+        stride=frame.options.get("stride", 1),
         **options,
     )
 
@@ -167,7 +173,7 @@ def count(frame: Frame, reply: GraspReply) -> Count:
 
 
 def posted_points(frame: Frame) -> Array:
-    """Points (N, 3) of a frame's depth image, in the camera's frame."""
+    """Points (N, 3) of all of a frame's depth image, in the camera's frame."""
     with Image.open(io.BytesIO(frame.depth)) as image:
         counts = np.array(image)
     k = frame.options["intrinsics"]
@@ -217,10 +223,17 @@ def table(counts: Sequence[Count]) -> str:
     known = [one for one in counts if one.on_things is not None]
     things = f"{sum(one.on_things or 0 for one in known)} of {sum(one.grasps for one in known)}"
     grasps, colliding = sum(one.grasps for one in counts), sum(one.colliding for one in counts)
-    middle = float(np.median([one.milliseconds for one in counts]))
+    middle = float(np.nanmedian([one.milliseconds for one in counts]))
     lines.append(f"{'all':{width}}  {grasps:6}  {colliding:9}  {things:>9}  {middle:6.0f} (median)")
     lines.append(f"the best grasp collides in {sum(one.first_collides for one in counts)} of {len(counts)} frames")
     return "\n".join(lines)
+
+
+def _counted(client: GraspClient, frame: Frame) -> Count:
+    try:
+        return count(frame, ask(client, frame))
+    except ProblemError as refused:
+        return Count(frame.name, 0, 0, False, None, np.nan, str(refused), ())
 
 
 @contextmanager
@@ -251,7 +264,7 @@ def main(arguments: Sequence[str] | None = None) -> None:
         return
     asked = [frame.bare() if chosen.bare else frame for frame in read_frames(chosen.folder)]
     with _service(chosen.url, chosen.threads) as client:
-        counts = [count(frame, ask(client, frame)) for frame in asked]
+        counts = [_counted(client, frame) for frame in asked]
     print(table(counts))
     if chosen.out is not None:
         chosen.out.write_text(json.dumps([asdict(one) for one in counts], indent=1) + "\n", encoding="utf-8")
