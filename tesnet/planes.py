@@ -172,8 +172,8 @@ class Surfaces:
         noise = robust_sd(residuals[near & sure])
         own = self._piece(up, able & (np.abs(residuals) <= max(DEVIATIONS * noise, LEAST_BAND)))
         enough = own.sum() >= max(FEWEST_POINTS, LEAST_SHARE * len(self.points))
-        if enough and radius(self.points[own & sure], up) >= LEAST_RADIUS:
-            yield Plane(up, height, noise, outline(self.points[own], up), own)
+        if enough and (own & sure).any() and radius(self.points[own & sure], up) >= LEAST_RADIUS:
+            yield Plane(up, height, noise, outline(self.points[own & sure], up), own)
 
     def _piece(self, up: Array, near: Mask) -> Mask:
         """Of points (mask (P,)) about a plane, those of the largest piece that hangs together."""

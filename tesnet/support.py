@@ -18,6 +18,8 @@ LOWEST = 0.003
 """Above the plane, or `DEVIATIONS` of its noise where that is more: what is lower is the plane."""
 HIGHEST = 0.35
 """Above the plane: what reaches higher does not stand on it for a hand to take."""
+EDGE = 0.02
+"""Of an outline."""
 DEVIATIONS = 3.0
 BELOW = 0.015
 MOST_SEEN_THROUGH = 0.15
@@ -89,11 +91,14 @@ def _figures(plane: SupportPlane, query: GraspQuery) -> str:
 
 
 def region(points: NDArray[np.float32], plane: SupportPlane) -> Mask:
-    """Mask (N,) of the points (N, 3) of what stands on a plane: above its noise, to 0.35 m, inside its outline."""
+    """Mask (N,) of the points (N, 3) of what stands on a plane: above its noise, to 0.35 m, inside its outline.
+
+    A margin of `EDGE` is left out, where walls and the sides of shelves and bins begin.
+    """
     heights = points @ plane.up.astype(points.dtype) - plane.height
     rows = np.flatnonzero((heights > plane.clearance) & (heights <= HIGHEST))
     mask = np.zeros(len(points), dtype=bool)
-    mask[rows[within(points[rows], plane.sides)]] = True
+    mask[rows[within(points[rows], plane.sides - np.array([0, 0, 0, EDGE]))]] = True
     return mask
 
 
