@@ -262,7 +262,7 @@ def _parser() -> argparse.ArgumentParser:
         type=_number,
         nargs=6,
         metavar=("X0", "Y0", "Z0", "X1", "Y1", "Z1"),
-        help="box; points outside are ignored",
+        help="box; points outside count for collision alone",
     )
     add(
         "--approach",

@@ -124,7 +124,7 @@ class GraspOptions(TypedDict, total=False):
         up: direction against gravity, or `"auto"`: that of the plane that things stand on, found with its height; a
             warning then says where. Default: auto for a depth image; for points none, so that grasps from below are not
             filtered, and a warning says so.
-        workspace: `{"min": ..., "max": ...}`; points outside are ignored.
+        workspace: `{"min": ..., "max": ...}`; points outside count for collision alone.
         support_height: height of the support plane along `up` (needs `up`), or `"auto"` to find it: a warning then says
             where.
         target: `{"box": {"min": ..., "max": ...}}`, `{"indices": [...]}` or, with a mask, `{"label": N}`: candidates

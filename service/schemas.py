@@ -159,8 +159,8 @@ class GraspOptions(RequestPart):
     )
     workspace: Box | None = Field(
         default=None,
-        description='Box {"min": [x, y, z], "max": [x, y, z]} in metres; points outside are ignored. With `up` the '
-        "scores allow for what may stand beyond its upright sides. Default: none.",
+        description='Box {"min": [x, y, z], "max": [x, y, z]} in metres; points outside count for collision alone. '
+        "With `up` the scores allow for what may stand beyond its upright sides. Default: none.",
     )
     support_height: float | Literal["auto"] | None = Field(
         default=None,

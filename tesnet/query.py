@@ -48,7 +48,8 @@ class GraspQuery:
         viewpoints: (3,) or (V, 3) camera positions in the cloud frame; None is the origin.
         up: (3,) direction against gravity, made unit length, or `auto`: that of the plane that things stand on, whose
             height is found as well.
-        workspace: points outside are ignored; with `up`, scores allow for what may stand beyond its upright sides.
+        workspace: points outside count for collision alone; with `up`, scores allow for what may stand beyond its
+            upright sides.
         support_height: height of the support plane along `up`, metres, or `auto` to find that which things stand on.
         target: candidates come from it alone; the other points still count for collision.
         approach: cone of directions of travel.
