@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import argparse
 import json
+import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -63,6 +64,22 @@ def _share(text: str) -> float | None:
     return value
 
 
+def _above_zero(text: str) -> float:
+    value = float(text)
+    if not 0 < value < math.inf:
+        raise argparse.ArgumentTypeError(f"{text} is not above 0")
+    return value
+
+
+def _limits(given: list[float] | None, name: str) -> tuple[float, float] | None:
+    if given is None:
+        return None
+    low, high = given
+    if low > high:
+        raise LabelsError(f"--{name} {low:g} {high:g}: the first is larger than the second; give the smaller one first")
+    return low, high
+
+
 def _add_generate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--scene", choices=("packed", "pile"), required=True)
     parser.add_argument("--objects", required=True, help="object sets, joined with commas: names, folders or lists")
@@ -81,6 +98,17 @@ def _add_generate(parser: argparse.ArgumentParser) -> None:
     )
     parser.add_argument("--camera", choices=get_args(Preset), default="random")
     parser.add_argument("--gripper", choices=tuple(HANDS), default="franka", help="the hand that tries the grasps")
+    for name, words in (("scale", "scale"), ("mass", "mass in kilograms"), ("friction", "coefficient of friction")):
+        parser.add_argument(
+            f"--{name}",
+            type=_above_zero,
+            nargs=2,
+            metavar=("LOW", "HIGH"),
+            help=f"draw each object's {words} between these (default: the protocol's)",
+        )
+    parser.add_argument(
+        "--things", type=_positive, metavar="N", help="1 to N objects a table, all alike (default: up to 5)"
+    )
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--workers", type=_positive, default=1)
     parser.add_argument("--ray", metavar="ADDRESS", help="make the scenes on this Ray cluster")
@@ -101,6 +129,10 @@ def _generate(options: argparse.Namespace) -> dict[str, object]:
         mine=options.mine,
         camera=options.camera,
         gripper=options.gripper,
+        scale=_limits(options.scale, "scale"),
+        mass=_limits(options.mass, "mass"),
+        friction=_limits(options.friction, "friction"),
+        things=options.things,
     )
     return generate(config, options.labels, options.workers, options.out, options.resume, options.ray)
 

@@ -30,7 +30,7 @@ from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcomes import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
-from simharness.sim.scene import describe, make_scene, scales_for
+from simharness.sim.scene import Variety, describe, make_scene, scales_for
 from simharness.sim.world import World
 from tesnet import candidates, cloud, networks
 from tesnet.collision import blocked
@@ -59,6 +59,10 @@ class GenerateConfig:
             scores best, where its mistakes become failed attempts.
         camera: preset.
         gripper: name of the hand.
+        scale: limits of the objects' scale for the Panda; None is the protocol's.
+        mass: limits in kilograms; None is the protocol's one.
+        friction: limits of the objects' coefficient; None is the protocol's one.
+        things: at most this many objects stand on a table, every number alike; None draws up to five, five more often.
     """
 
     scene: Literal["packed", "pile"]
@@ -71,6 +75,10 @@ class GenerateConfig:
     mine: Path | None = None
     camera: Preset = "random"
     gripper: str = "franka"
+    scale: tuple[float, float] | None = None
+    mass: tuple[float, float] | None = None
+    friction: tuple[float, float] | None = None
+    things: int | None = None
 
     @property
     def hand(self) -> KnownHand:
@@ -98,7 +106,7 @@ def generate(
         SimError: there is no such cluster, or a worker failed.
     """
     out.mkdir(parents=True, exist_ok=True)
-    settings = {key: str(value) if isinstance(value, Path) else value for key, value in asdict(config).items()}
+    settings = {key: _plain(value) for key, value in asdict(config).items()}
     _claim(out, settings, resume)
     object_sets(config)  # fail here, not in a worker
     done = {int(path.stem.split("_")[1]) for path in out.glob("scene_*.npz")}
@@ -140,6 +148,13 @@ def generate(
     }
     (out / "account.json").write_text(json.dumps(account, indent=2) + "\n")
     return account
+
+
+def _plain(value: Any) -> Any:
+    """A setting as JSON gives it back."""
+    if isinstance(value, tuple):
+        return list(value)
+    return str(value) if isinstance(value, Path) else value
 
 
 def _claim(out: Path, settings: dict[str, Any], resume: bool) -> None:
@@ -218,14 +233,14 @@ def label_scene(
     models = sets[int(rng.integers(len(sets)))]
     with World() as world:
         hand = Hand(world, config.hand)
-        # Fewer objects, too: a table that is being cleared holds fewer and fewer.
         scene = make_scene(
             world,
             config.scene,
             models,
             rng,
-            num_objects=int(rng.choice([1, 2, 3, 4, 5, 5])),
-            scale_range=scales_for(config.scene, config.hand.gripper),
+            num_objects=_number_of_things(config, rng),
+            scale_range=scales_for(config.scene, config.hand.gripper, config.scale),
+            variety=Variety(config.mass, config.friction),
         )
         description = describe(scene) | {"seed": config.seed, "number": number, "camera": config.camera, "cameras": []}
         views: list[LabelledView] = []
@@ -239,6 +254,12 @@ def label_scene(
             if view is not None:
                 views.append(view)
         return description, views
+
+
+def _number_of_things(config: GenerateConfig, rng: np.random.Generator) -> int:
+    if config.things is not None:
+        return int(rng.integers(config.things)) + 1
+    return int(rng.choice([1, 2, 3, 4, 5, 5]))  # fewer too: a table that is being cleared holds fewer and fewer
 
 
 def _rng(config: GenerateConfig, *numbers: int) -> np.random.Generator:

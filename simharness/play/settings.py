@@ -87,7 +87,7 @@ class RunSettings:
         str,
         Flag(
             "round",
-            "procedural, pybullet-random, a folder of URDF/OBJ files or a .txt list of them "
+            "procedural, pybullet-random, novel, flat, wide, a folder of URDF/OBJ files or a .txt list of them "
             "(default: procedural for packed, pybullet-random for pile scenes)",
             "NAME_OR_PATH",
         ),

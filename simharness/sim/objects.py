@@ -2,7 +2,7 @@
 
 Knows files, not physics: nothing here imports the simulator or the network.
 
-A set is one of four built-in names, a folder, or a `.txt` list. Each object is a URDF of one rigid link, in metres,
+A set is one of the built-in names, a folder, or a `.txt` list. Each object is a URDF of one rigid link, in metres,
 with +z up. A built-in test set and its training set share no object.
 
 ==========================  ====================================================================================
@@ -10,6 +10,8 @@ with +z up. A built-in test set and its training set share no object.
 `procedural-train`          the same families, training seeds
 `pybullet-random`           `random_urdfs` 900-999 of the pybullet package
 `pybullet-random-train`     `random_urdfs` 000-899
+`novel`, `flat`, `wide`     made by `simharness.sim.shapes`, of families that no training set holds
+`shapes-train`              made by `simharness.sim.shapes`, of other families
 ==========================  ====================================================================================
 """
 
@@ -19,7 +21,7 @@ import hashlib
 import importlib.util
 import os
 import xml.etree.ElementTree as ET
-from collections.abc import Iterable, Sequence
+from collections.abc import Callable, Iterable, Sequence
 from dataclasses import dataclass
 from functools import lru_cache
 from pathlib import Path, PurePosixPath
@@ -30,13 +32,15 @@ import numpy as np
 import numpy.typing as npt
 
 from simharness.errors import ObjectSetError
-from simharness.sim import procedural
+from simharness.sim import procedural, shapes, solids
+from simharness.sim.shapes.sets import SETS
+from simharness.sim.solids import GeneratedObject
 from tesnet.whole_file import write_whole
 
 SceneKind = Literal["packed", "pile"]
 Array = npt.NDArray[np.float64]
 
-BUILT_IN_SETS = ("procedural", "procedural-train", "pybullet-random", "pybullet-random-train")
+BUILT_IN_SETS = ("procedural", "procedural-train", "pybullet-random", "pybullet-random-train", *SETS)
 
 #: The largest extent of an object must lie between these, after scaling.
 SMALLEST_EXTENT = 0.005
@@ -72,11 +76,13 @@ class ObjectModel:
         name: unique within its set and the same on every machine (`procedural/test/mug_03`, `packed/train/CokeCan`).
         urdf: the file, one rigid link, metres, +z up.
         scale_hint: multiplied with the scale that a scene draws.
+        sized: whether its size is that on the table, which a scene's scale then only varies.
     """
 
     name: str
     urdf: Path
     scale_hint: float = 1.0
+    sized: bool = False
 
 
 def load_object_set(
@@ -185,13 +191,17 @@ class _Source:
     name: str
     path: Path
     largest_middle: float | None = None
+    sized: bool = False
 
 
 def _find_sources(spec: str, scene: SceneKind, cache: Path) -> list[_Source]:
     if spec in ("pybullet-random", "pybullet-random-train"):
         return _random_urdfs(range(900) if spec.endswith("-train") else range(900, 1000))
     if spec in ("procedural", "procedural-train"):
-        return _procedural("train" if spec.endswith("-train") else "test", cache)
+        names = procedural.object_names("train" if spec.endswith("-train") else "test")
+        return _generated(names, procedural.generate_object, cache)
+    if spec in SETS:
+        return _generated(SETS[spec].names(), SETS[spec].make, cache, sized=SETS[spec].sized)
     path = Path(spec)
     if path.is_dir():
         sources = _sources_in_folder(path)
@@ -227,17 +237,20 @@ def _random_urdfs(numbers: Iterable[int]) -> list[_Source]:
     ]
 
 
-def _procedural(split: procedural.Split, cache: Path) -> list[_Source]:
-    """The generated objects, written to the cache under the version of the program that makes them."""
-    version = hashlib.sha256(Path(procedural.__file__).read_bytes()).hexdigest()[:16]
+def _generated(
+    names: Sequence[str], generate: Callable[[str], GeneratedObject], cache: Path, *, sized: bool = False
+) -> list[_Source]:
+    """Generated objects, written to the cache under the version of the programs that make them."""
+    programs = [Path(procedural.__file__), Path(solids.__file__), *sorted(Path(shapes.__file__).parent.glob("*.py"))]
+    version = hashlib.sha256(b"\0".join(program.read_bytes() for program in programs)).hexdigest()[:16]
     sources = []
-    for name in procedural.object_names(split):
-        folder = cache / f"procedural-{version}" / Path(name).relative_to("procedural")
+    for name in names:
+        folder = cache / f"generated-{version}" / name
         urdf = folder / "object.urdf"
         if not urdf.is_file() or not all(mesh.is_file() for mesh in _meshes(urdf)):
-            for file_name, data in procedural.generate_object(name).files().items():  # the URDF comes last
+            for file_name, data in generate(name).files().items():  # the URDF comes last
                 _write_to_cache(folder / file_name, data)
-        sources.append(_Source(name, urdf))
+        sources.append(_Source(name, urdf, sized=sized))
     return sources
 
 
@@ -371,7 +384,7 @@ def _to_model(source: _Source, cache: Path) -> ObjectModel:
     if source.largest_middle is not None:
         scale = min(1.0, source.largest_middle / float(np.sort(extents)[1]))
     _check_size(extents * scale, source)
-    return ObjectModel(source.name, urdf, scale)
+    return ObjectModel(source.name, urdf, scale, source.sized)
 
 
 def _wrap_mesh(source: _Source, cache: Path) -> Path:

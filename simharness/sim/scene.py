@@ -34,6 +34,7 @@ LARGEST_FACTOR = 1.25
 """Objects are scaled by a hand's opening in terms of the Panda's, up to this."""
 
 _PACKED_TRIES = 12
+_TRIES_PER_OBJECT = 2  # of crowded tables, which the protocol has not
 _PACKED_RANGE = (0.08, 0.22)
 _PACKED_CLEARANCE = 0.002
 _PILE_RANGE = (0.1, 0.2)
@@ -56,12 +57,40 @@ class PlacedObject:
         name: the object model's.
         scale: scale it was loaded with, the model's `scale_hint` included.
         pose: T_world_body.
+        mass: kilograms.
+        friction: coefficient of its surface; what touches it multiplies its own.
     """
 
     body_id: int
     name: str
     scale: float
     pose: Pose
+    mass: float = OBJECT_MASS
+    friction: float = OBJECT_FRICTION
+
+
+@dataclass(frozen=True, slots=True)
+class Variety:
+    """What differs between the objects of a scene; without arguments nothing but what the protocol varies.
+
+    Args:
+        mass: limits in kilograms, uniform in their logarithm; None is the protocol's one.
+        friction: limits of the uniform coefficient; None is the protocol's one.
+    """
+
+    mass: tuple[float, float] | None = None
+    friction: tuple[float, float] | None = None
+
+    def draw_mass(self, rng: np.random.Generator) -> float:
+        """Kilograms of one object; nothing is drawn without limits."""
+        return OBJECT_MASS if self.mass is None else float(np.exp(rng.uniform(*np.log(self.mass))))
+
+    def draw_friction(self, rng: np.random.Generator) -> float:
+        """Of one object; nothing is drawn without limits."""
+        return OBJECT_FRICTION if self.friction is None else float(rng.uniform(*self.friction))
+
+
+AS_PROTOCOL = Variety()
 
 
 @dataclass(frozen=True, slots=True)
@@ -79,10 +108,10 @@ class Scene:
     lost: tuple[str, ...] = ()
 
 
-def scales_for(kind: SceneKind, hand: Gripper) -> tuple[float, float]:
-    """Limits of the uniform scale for a hand: the protocol's, which are the Panda's, times how much wider it opens."""
+def scales_for(kind: SceneKind, hand: Gripper, for_panda: tuple[float, float] | None = None) -> tuple[float, float]:
+    """Limits of the uniform scale for a hand: the Panda's, by default the protocol's, times how much wider it opens."""
     factor = min(hand.max_width / PANDA.max_width, LARGEST_FACTOR)
-    low, high = SCALE_RANGES[kind]
+    low, high = SCALE_RANGES[kind] if for_panda is None else for_panda
     return factor * low, factor * high
 
 
@@ -93,12 +122,13 @@ def make_scene(
     rng: np.random.Generator,
     num_objects: int = 5,
     scale_range: tuple[float, float] | None = None,
+    variety: Variety = AS_PROTOCOL,
 ) -> Scene:
     """Put a table and randomly chosen objects into an empty world and let them settle.
 
-    Packed: at most 12 tries to stand an object upright, one that touches another is taken out again. Pile: objects in
-    any orientation are dropped one by one into an open box, which is then removed. Fewer objects than asked for may
-    stand in the end, even none.
+    Packed: at most 12 tries (on crowded tables two an object) to stand an object upright, one that touches another is
+    taken out again. Pile: objects in any orientation are dropped one by one into an open box, which is then removed.
+    Fewer objects than asked for may stand in the end, even none.
 
     Args:
         world: an empty world.
@@ -107,18 +137,19 @@ def make_scene(
         rng: source of every random choice.
         num_objects: how many to place.
         scale_range: limits of the uniform scale; the protocol's for this kind unless given.
+        variety: what else differs between objects.
     """
-    low, high = SCALE_RANGES[kind] if scale_range is None else scale_range
     table = _add_table(world)
+    draw = _Draw(rng, SCALE_RANGES[kind] if scale_range is None else scale_range, sum(SCALE_RANGES[kind]) / 2, variety)
     place = _stand_objects if kind == "packed" else _drop_objects
-    loaded = place(world, table, objects, rng, num_objects, (low, high))
+    loaded = place(world, table, objects, draw, num_objects)
     settle(world)
     placed = tuple(
-        PlacedObject(body, model.name, scale, world.pose(body))
-        for body, model, scale in loaded
+        PlacedObject(body, thing.model.name, thing.scale, world.pose(body), thing.mass, thing.friction)
+        for body, thing in loaded
         if body in world.objects
     )
-    return Scene(kind, placed, tuple(model.name for body, model, _ in loaded if body not in world.objects))
+    return Scene(kind, placed, tuple(thing.model.name for body, thing in loaded if body not in world.objects))
 
 
 def settle(world: World, limit: float = SETTLING_LIMIT) -> tuple[int, ...]:
@@ -150,6 +181,7 @@ def describe(scene: Scene) -> dict[str, Any]:
                 "scale": item.scale,
                 "position": item.pose.translation.tolist(),
                 "quaternion_xyzw": item.pose.quaternion_xyzw.tolist(),
+                **_unlike_protocol(item),
             }
             for item in scene.placed
         ],
@@ -166,39 +198,71 @@ def restore_scene(world: World, description: Mapping[str, Any], objects_by_name:
     placed = []
     for item in description["objects"]:
         pose = Pose.from_quaternion(item["quaternion_xyzw"], item["position"])
-        body = _load(world, objects_by_name[item["name"]], pose, item["scale"])
+        mass, friction = item.get("mass", OBJECT_MASS), item.get("friction", OBJECT_FRICTION)
+        body = _load(world, _Thing(objects_by_name[item["name"]], item["scale"], mass, friction), pose)
         world.set_pose(body, item["position"], item["quaternion_xyzw"])
-        placed.append(PlacedObject(body, item["name"], item["scale"], pose))
+        placed.append(PlacedObject(body, item["name"], item["scale"], pose, mass, friction))
     return Scene(description["kind"], tuple(placed))
 
 
-_Loaded = list[tuple[int, ObjectModel, float]]
+def _unlike_protocol(item: PlacedObject) -> dict[str, float]:
+    """What a description says of mass and friction: nothing where they are the protocol's."""
+    if (item.mass, item.friction) == (OBJECT_MASS, OBJECT_FRICTION):
+        return {}
+    return {"mass": item.mass, "friction": item.friction}
+
+
+@dataclass(frozen=True, slots=True)
+class _Thing:
+    """An object as a scene holds it; `scale` includes the model's hint."""
+
+    model: ObjectModel
+    scale: float
+    mass: float
+    friction: float
+
+
+@dataclass(frozen=True, slots=True)
+class _Draw:
+    """The random choices of a scene; at scale `middle`, sized things have their size."""
+
+    rng: np.random.Generator
+    scale_range: tuple[float, float]
+    middle: float
+    variety: Variety
+
+    def thing(self, model: ObjectModel) -> _Thing:
+        scale = float(self.rng.uniform(*self.scale_range)) * model.scale_hint / (self.middle if model.sized else 1.0)
+        return _Thing(model, scale, self.variety.draw_mass(self.rng), self.variety.draw_friction(self.rng))
+
+
+_Loaded = list[tuple[int, _Thing]]
 
 
 def _stand_objects(
     world: World,
     table: int,
     objects: Sequence[ObjectModel],
-    rng: np.random.Generator,
+    draw: _Draw,
     num_objects: int,
-    scale_range: tuple[float, float],
 ) -> _Loaded:
+    rng = draw.rng
     loaded: _Loaded = []
-    for _ in range(_PACKED_TRIES):
+    for _ in range(max(_PACKED_TRIES, _TRIES_PER_OBJECT * num_objects)):
         if len(loaded) == num_objects:
             break
         model = objects[int(rng.integers(len(objects)))]
         yaw = rng.uniform(0.0, 2 * np.pi)
         x, y = rng.uniform(*_PACKED_RANGE, size=2)
-        scale = float(rng.uniform(*scale_range)) * model.scale_hint
+        thing = draw.thing(model)
         upright = Pose.from_quaternion([0.0, 0.0, np.sin(yaw / 2), np.cos(yaw / 2)], [x, y, TABLE_HEIGHT + 0.5])
-        body = _load(world, model, upright, scale)
+        body = _load(world, thing, upright)
         _lower_onto(world, body, table)
         world.find_contacts()
         if world.contacts(body):
             world.remove(body)
             continue
-        loaded.append((body, model, scale))
+        loaded.append((body, thing))
         _wait(world, SETTLING_LIMIT)
     return loaded
 
@@ -207,28 +271,28 @@ def _drop_objects(
     world: World,
     table: int,  # noqa: ARG001 - both ways of placing objects are called alike
     objects: Sequence[ObjectModel],
-    rng: np.random.Generator,
+    draw: _Draw,
     num_objects: int,
-    scale_range: tuple[float, float],
 ) -> _Loaded:
+    rng = draw.rng
     walls = _add_walls(world)
     loaded: _Loaded = []
     for _ in range(num_objects):
         model = objects[int(rng.integers(len(objects)))]
         turned = Pose.random(rng)
         x, y = rng.uniform(*_PILE_RANGE, size=2)
-        scale = float(rng.uniform(*scale_range)) * model.scale_hint
+        thing = draw.thing(model)
         above = np.array([x, y, TABLE_HEIGHT + _PILE_DROP])
-        body = _load(world, model, Pose(turned.rotation, above), scale)
-        loaded.append((body, model, scale))
+        body = _load(world, thing, Pose(turned.rotation, above))
+        loaded.append((body, thing))
         _wait(world, _PILE_SETTLING_LIMIT)
     for wall in walls:
         world.remove(wall)
     return loaded
 
 
-def _load(world: World, model: ObjectModel, pose: Pose, scale: float) -> int:
-    return world.load_object(model.urdf, pose, scale=scale, mass=OBJECT_MASS, friction=OBJECT_FRICTION)
+def _load(world: World, thing: _Thing, pose: Pose) -> int:
+    return world.load_object(thing.model.urdf, pose, scale=thing.scale, mass=thing.mass, friction=thing.friction)
 
 
 def _lower_onto(world: World, body: int, table: int) -> None:

@@ -122,3 +122,17 @@ def test_labels_of_another_hand_say_so_and_keep_its_poses(tmp_path: Path) -> Non
     np.testing.assert_allclose(view.candidates.Ts_canonical_grasp[:, :3, 3], expected, atol=1e-5)
     with pytest.raises(LabelsError, match="labels of rg2; an archive keeps those of franka alone"):
         pack([tmp_path], tmp_path / "archive")
+
+
+def test_tables_may_hold_more_things_of_other_weight_and_grip(tmp_path: Path) -> None:
+    varied = replace(CONFIG, scale=(0.4, 0.6), mass=(0.05, 0.1), friction=(0.3, 0.4), things=9, seed=1)
+    generate(varied, 1, 1, tmp_path)
+    description, _ = load_scene(scene_files([tmp_path])[0])
+    for item in description["objects"]:
+        assert 0.4 <= item["scale"] <= 0.6
+        assert 0.05 <= item["mass"] <= 0.1
+        assert 0.3 <= item["friction"] <= 0.4
+    # The folder knows its settings again, written and read.
+    generate(varied, 1, 1, tmp_path, resume=True)
+    with pytest.raises(LabelsError, match="other settings"):
+        generate(replace(varied, things=8), 1, 1, tmp_path, resume=True)

@@ -5,7 +5,8 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simharness.sim.procedural import FAMILIES, OBJECTS_PER_FAMILY, GeneratedObject, Mesh, generate_object, object_names
+from simharness.sim.procedural import FAMILIES, OBJECTS_PER_FAMILY, generate_object, object_names
+from simharness.sim.solids import GeneratedObject, Mesh
 
 NAMES = [*object_names("test"), *(name for name in object_names("train") if name.endswith(("_00", "_05")))]
 

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -10,11 +11,14 @@ import pytest
 
 from simharness.sim.objects import ObjectModel, SceneKind
 from simharness.sim.scene import (
+    OBJECT_FRICTION,
+    OBJECT_MASS,
     RESTING_SPEED,
     SCALE_RANGES,
     TABLE_HEIGHT,
     WORKSPACE,
     Scene,
+    Variety,
     describe,
     make_scene,
     restore_scene,
@@ -180,3 +184,44 @@ def test_objects_are_scaled_by_a_hands_opening(kind: SceneKind, name: str, facto
     assert found == pytest.approx(tuple(factor * limit for limit in protocol))
     if name == "franka":
         assert found == protocol
+
+
+def test_mass_and_friction_vary_within_their_limits_and_are_put_back_with_the_scene() -> None:
+    variety = Variety(mass=(0.05, 1.0), friction=(0.3, 1.0))
+    with World() as world:
+        scene = make_scene(world, "packed", [CUBE], np.random.default_rng(3), variety=variety)
+        masses, frictions = ([getattr(item, name) for item in scene.placed] for name in ("mass", "friction"))
+        assert len({*masses, *frictions}) == 2 * len(scene.placed)
+        assert all(0.05 <= mass <= 1.0 for mass in masses)
+        assert all(0.3 <= friction <= 1.0 for friction in frictions)
+        description = json.loads(json.dumps(describe(scene)))
+    with World() as world:
+        restored = restore_scene(world, description, {"cube": CUBE})
+        assert [(item.mass, item.friction) for item in restored.placed] == list(zip(masses, frictions, strict=True))
+    rng = np.random.default_rng(0)
+    drawn = [variety.draw_mass(rng) for _ in range(2000)]
+    assert np.median(drawn) == pytest.approx(np.sqrt(0.05), rel=0.2)
+
+
+def test_without_variety_nothing_more_is_drawn_or_said() -> None:
+    rng, untouched = np.random.default_rng(0), np.random.default_rng(0)
+    assert (Variety().draw_mass(rng), Variety().draw_friction(rng)) == (OBJECT_MASS, OBJECT_FRICTION)
+    assert rng.uniform() == untouched.uniform()
+    with World() as world:
+        description = describe(make_scene(world, "packed", [CUBE], np.random.default_rng(1)))
+    assert all("mass" not in item and "friction" not in item for item in description["objects"])
+
+
+@pytest.mark.parametrize("kind", SCALE_RANGES)
+def test_a_thing_of_its_own_size_keeps_it_around_the_middle_of_the_scales(kind: SceneKind) -> None:
+    sized = replace(CUBE, sized=True)
+    low, high = SCALE_RANGES[kind]
+    with World() as world:
+        for item in make_scene(world, kind, [sized], np.random.default_rng(2)).placed:
+            assert 2 * low / (low + high) <= item.scale <= 2 * high / (low + high)
+
+
+def test_crowded_tables_hold_more_than_five() -> None:
+    small = replace(CUBE, scale_hint=0.4)
+    with World() as world:
+        assert len(make_scene(world, "packed", [small], np.random.default_rng(0), num_objects=12).placed) > 8
