@@ -108,6 +108,13 @@ def test_a_hand_is_named_or_described(
     assert json.loads(query["gripper"][0]) == asked
 
 
+def test_up_may_be_found(server: ScriptedServer, cloud: str, found: dict[str, Any]) -> None:
+    server.script = [answering(found)]
+    assert main([cloud, "--url", server.url, "--up", "auto", "--support-height", "auto"]) == 0
+    query = parse_qs(urlsplit(server.received[0].target).query)
+    assert (json.loads(query["up"][0]), json.loads(query["support_height"][0])) == ("auto", "auto")
+
+
 def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict[str, Any]) -> None:
     server.script = [answering(found)]
     flags = (
@@ -156,6 +163,7 @@ def test_flags_left_out_stay_the_service_s_defaults(server: ScriptedServer, clou
         ["cloud.step"],
         [],
         ["c.ply", "--up", "0", "0"],
+        ["c.ply", "--up", "auto", "0", "1"],
         ["c.ply", "--up", "0", "0", "nan"],
         ["c.ply", "--support-height", "0"],
         ["c.ply", "--unseen", "maybe"],

@@ -168,6 +168,7 @@ INVALID_OPTIONS: dict[str, tuple[str, Any, str]] = {
     "viewpoint of two numbers": ("viewpoint", [0, 1], "viewpoint"),
     "viewpoint of no positions": ("viewpoint", [], "viewpoint"),
     "too many viewpoints": ("viewpoint", [[0, 0, 1]] * 65, "64"),
+    "up of another word": ("up", "down", "auto"),
     "up of no length": ("up", [0, 0, 0], "length"),
     "up of four numbers": ("up", [0, 0, 1, 0], "up"),
     "workspace inside out": ("workspace", {"min": [0, 0, 0], "max": [1, 1, -1]}, "min"),

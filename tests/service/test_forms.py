@@ -147,6 +147,27 @@ def test_a_depth_image_gives_grasps_on_what_its_mask_marks(http: httpx.Client) -
     assert post(http, black, options).json()["reason"] == "no_candidates"
 
 
+def test_up_is_found_in_a_depth_image_and_in_a_cloud_where_it_is_asked_for(http: httpx.Client) -> None:
+    view = box_on_table()
+    image = {"depth": png(view.counts)}
+    bare = post(http, image, {**view.camera, "max_candidates": 300}).json()
+    (note,) = [note for note in bare["warnings"] if note.startswith("up auto: [")]
+    assert "the plane at" in note
+    assert steady(bare) == steady(post(http, image, {**view.camera, "up": "auto", "max_candidates": 300}).json())
+    for grasp in bare["grasps"]:
+        assert (np.abs(np.array(grasp["contact_point"]) - [0, 0, SIZE[2] / 2]) <= SIZE / 2 + 0.003).all()
+    points = view.T_cloud_camera.apply(view.intrinsics.back_project(view.counts / 1000)).astype(np.float32)
+    asked = {"viewpoint": view.T_cloud_camera.translation.tolist(), "up": "auto", "max_candidates": 300}
+    in_query, in_json = (
+        post_octets(http, points, **asked),
+        http.post("/grasps", json={"points": points.tolist(), **asked}),
+    )
+    assert any(note.startswith("up auto: [") for note in in_query["warnings"])
+    assert any(note.startswith("up auto: [") for note in in_json.json()["warnings"])
+    without = post_octets(http, points, **{name: value for name, value in asked.items() if name != "up"})
+    assert not any("up auto" in note for note in without["warnings"])
+
+
 def test_depth_is_scaled_and_moved_as_the_camera_says() -> None:
     depth = np.zeros((3, 4), np.uint16)
     depth[1, 2], depth[2, 0] = 1000, 2000
