@@ -21,7 +21,7 @@ from typing import TYPE_CHECKING, Any
 from tqdm import tqdm
 
 from simharness.errors import RunBroken, SimError
-from simharness.options import (
+from simharness.flags_from_settings import (
     failures_parser,
     out_of,
     replay_parser,

@@ -7,7 +7,7 @@ from collections.abc import Mapping
 from types import MappingProxyType
 
 from tesnet.hands import ag95, franka, hand_e, rg2, rg6, robotiq_2f85, robotiq_2f140, wsg50, xarm
-from tesnet.hands.hand import KnownHand
+from tesnet.hands.entry import KnownHand
 
 HANDS: Mapping[str, KnownHand] = MappingProxyType(
     {

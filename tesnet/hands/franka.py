@@ -10,7 +10,7 @@ manual allows 30 to 70 N of continuous force. The payload is the arm's.
 from __future__ import annotations
 
 from tesnet.geometry import PANDA
-from tesnet.hands.hand import KnownHand
+from tesnet.hands.entry import KnownHand
 
 HAND = KnownHand(
     gripper=PANDA,

@@ -13,7 +13,7 @@ from __future__ import annotations
 import math
 
 from tesnet.geometry import Gripper
-from tesnet.hands.hand import KnownHand
+from tesnet.hands.entry import KnownHand
 
 HAND = KnownHand(
     gripper=Gripper(

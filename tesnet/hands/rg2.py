@@ -10,7 +10,7 @@ Forces (3 to 40 N) and payload: OnRobot's data sheet 1.4 of 2015.
 from __future__ import annotations
 
 from tesnet.geometry import Gripper
-from tesnet.hands.hand import KnownHand
+from tesnet.hands.entry import KnownHand
 
 HAND = KnownHand(
     gripper=Gripper(

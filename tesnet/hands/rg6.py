@@ -10,7 +10,7 @@ The greatest force stands in the URDF; the least force and the payload are unver
 from __future__ import annotations
 
 from tesnet.geometry import Gripper
-from tesnet.hands.hand import KnownHand
+from tesnet.hands.entry import KnownHand
 
 HAND = KnownHand(
     gripper=Gripper(

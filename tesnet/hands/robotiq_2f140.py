@@ -10,7 +10,7 @@ Forces (10 to 125 N) and payload: Robotiq's product sheet of May 2025.
 from __future__ import annotations
 
 from tesnet.geometry import Gripper
-from tesnet.hands.hand import KnownHand
+from tesnet.hands.entry import KnownHand
 
 HAND = KnownHand(
     gripper=Gripper(

@@ -9,7 +9,7 @@ No data sheet was found: force and payload are guesses.
 from __future__ import annotations
 
 from tesnet.geometry import Gripper
-from tesnet.hands.hand import KnownHand
+from tesnet.hands.entry import KnownHand
 
 HAND = KnownHand(
     gripper=Gripper(

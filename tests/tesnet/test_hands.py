@@ -55,7 +55,7 @@ def test_a_hand_has_the_name_of_its_file(name: str) -> None:
 def test_every_file_of_a_hand_is_listed_and_the_first_is_the_default() -> None:
     folder = importlib.resources.files("tesnet.hands")
     files = {entry.name[:-3] for entry in folder.iterdir() if entry.name.endswith(".py")}
-    assert set(HANDS) == files - {"__init__", "hand"}
+    assert set(HANDS) == files - {"__init__", "entry"}
     assert next(iter(HANDS.values())).gripper is PANDA
     assert {name for name, hand in HANDS.items() if not hand.simulated} == {"wsg50", "xarm", "rg6", "ag95"}
 

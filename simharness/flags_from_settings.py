@@ -1,6 +1,7 @@
-"""The flags of `python -m simharness` and what they ask for. It carries nothing out.
+"""The command lines of `python -m simharness` and what they ask for. It carries nothing out.
 
-Flags that decide a run's results follow from `RunSettings`: its fields say the type, the words and the limits.
+Flags that decide a run's results stand in `play/settings.py`: the fields of `RunSettings` say the type, the words and
+the limits. Here are the commands, and the few flags that change no result.
 """
 
 from __future__ import annotations

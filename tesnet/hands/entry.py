@@ -1,4 +1,4 @@
-"""What is known of a hand beside its sizes."""
+"""What the file of each hand says: its sizes and what else is known of it."""
 
 from __future__ import annotations
 

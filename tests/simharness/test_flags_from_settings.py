@@ -7,7 +7,7 @@ from typing import Any, Literal, get_args, get_origin
 import pytest
 
 from simharness.errors import UsageError
-from simharness.options import out_of, robustness_parser, run_parser, settings_of
+from simharness.flags_from_settings import out_of, robustness_parser, run_parser, settings_of
 from simharness.play.settings import RunSettings, flags
 
 
