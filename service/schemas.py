@@ -223,7 +223,9 @@ class GraspOptions(RequestPart):
     )
     seed: int = Field(default=0, ge=0, le=MAX_SEED, description="Makes sampling repeatable, 0 to 2^63 - 1.")
     model: str | None = Field(
-        default=None, max_length=64, description="One of the networks that `GET /model` lists. Default: the first."
+        default=None,
+        max_length=64,
+        description="One of the networks that `GET /model` lists. Default: the first, tesnet where it is loaded.",
     )
 
 
@@ -464,7 +466,9 @@ class NetworkOut(ModelIdentity):
 class ModelResponse(ResponsePart):
     """Answer of `GET /model`."""
 
-    models: list[NetworkOut] = Field(description="The loaded networks; the first is the default.")
+    models: list[NetworkOut] = Field(
+        description="The loaded networks; the first is the default: tesnet where it is loaded."
+    )
     gripper: GripperOut = Field(description="The default hand.")
     hands: list[HandOut] = Field(
         default_factory=list, description="Every hand that a request's `gripper` may name; the first is the default."

@@ -75,8 +75,8 @@ class Settings(BaseModel):
     models: tuple[NetworkName, ...] = Field(
         default_factory=lambda: ("tesnet",),
         min_length=1,
-        description=f"Networks to load, separated by commas, of {', '.join(NETWORK_NAMES)}; the first answers requests "
-        "without `model`. Default: tesnet.",
+        description=f"Networks to load, separated by commas, of {', '.join(NETWORK_NAMES)}. Requests without `model` "
+        "are answered by tesnet or, where it is not loaded, by the first. Default: tesnet.",
     )
     weights: Mapping[NetworkName, Path] = Field(
         default_factory=dict,
@@ -164,10 +164,10 @@ class Settings(BaseModel):
 
     @field_validator("models")
     @classmethod
-    def _once(cls, names: tuple[NetworkName, ...]) -> tuple[NetworkName, ...]:
+    def _default_first(cls, names: tuple[NetworkName, ...]) -> tuple[NetworkName, ...]:
         if len(set(names)) < len(names):
             raise ValueError("a network twice")
-        return names
+        return tuple(sorted(names, key=lambda name: name != "tesnet"))
 
     @field_validator("weights", mode="before")
     @classmethod

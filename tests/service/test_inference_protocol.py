@@ -116,6 +116,21 @@ def test_options_may_be_strings_as_the_protocol_wants_them(http: httpx.Client, c
     assert [output["name"] for output in strings["outputs"]] == ["scores", "poses"]
 
 
+def test_up_is_found_where_it_is_asked_for(client: triton.InferenceServerClient) -> None:
+    across, along = np.meshgrid(np.linspace(-0.2, 0.2, 80), np.linspace(-0.2, 0.2, 80))
+    table = np.stack([across, along, np.zeros_like(across)], -1).reshape(-1, 3)
+    box = np.abs(table[:, :2]).max(axis=1) < 0.02
+    points = (table + np.outer(box, [0, 0, 0.05])).astype(np.float32)
+    asked = {"viewpoint": "[0.3, 0, 0.5]", "max_candidates": "300"}
+    metas = [
+        json.loads(client.infer("tesnet", [tensor(points, binary=True)], parameters=asked | up).as_numpy("meta")[0])
+        for up in ({"up": "auto"}, {})
+    ]
+    (note,) = [note for note in metas[0]["warnings"] if note.startswith("up auto: [")]
+    assert "the plane at" in note
+    assert not any("up auto" in note for note in metas[1]["warnings"])
+
+
 def test_tritons_client_shows_the_problems_detail(client: triton.InferenceServerClient) -> None:
     points = tensor(np.zeros((2, 3), np.float32), binary=True)
     with pytest.raises(InferenceServerException, match=r"max_grasps: is 0.*1000") as refused:

@@ -16,7 +16,7 @@ from tests.service.conftest import Cloud
 
 @pytest.fixture(scope="module")
 def served(start_service: StartService) -> Iterator[httpx.Client]:
-    with start_service(GRASP_MODELS="tesnet,heuristic", GRASP_MAX_BATCH="8") as service:
+    with start_service(GRASP_MODELS="heuristic,tesnet", GRASP_MAX_BATCH="8") as service:
         service.wait_for("ready")
         with httpx.Client(base_url=service.url, timeout=PATIENCE_S) as client:
             yield client
@@ -26,7 +26,9 @@ def body(cloud: Cloud, **options: Any) -> dict[str, Any]:
     return {"points": cloud.tolist(), "viewpoint": [0.4, 0.2, 0.5], "up": [0, 0, 1], "max_candidates": 200, **options}
 
 
-def test_the_option_model_picks_the_network_and_the_first_is_the_default(served: httpx.Client, cloud: Cloud) -> None:
+def test_the_option_model_picks_the_network_and_tesnet_answers_unasked_wherever_it_was_named(
+    served: httpx.Client, cloud: Cloud
+) -> None:
     listed = {model["name"]: model for model in served.get("/model").json()["models"]}
     assert list(listed) == ["tesnet", "heuristic"]
     assert listed["heuristic"]["weights_sha256"] is None

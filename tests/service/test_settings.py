@@ -101,6 +101,8 @@ def test_several_networks_have_their_weights_by_name() -> None:
     names = {"GRASP_MODELS": "TESNET, edgegrasp,heuristic"}
     assert load_settings(names).models == ("tesnet", "edgegrasp", "heuristic")
     assert load_settings(names).weights == {}
+    assert load_settings({"GRASP_MODELS": "heuristic,gpd,tesnet"}).models == ("tesnet", "heuristic", "gpd")
+    assert load_settings({"GRASP_MODELS": "heuristic,gpd"}).models == ("heuristic", "gpd")
     one = load_settings(names | {"GRASP_WEIGHTS": "edgegrasp=/a=b/edge.safetensors"})
     assert one.weights == {"edgegrasp": Path("/a=b/edge.safetensors")}
     two = load_settings(names | {"GRASP_WEIGHTS": "edgegrasp=e.safetensors, tesnet=t.safetensors"})
