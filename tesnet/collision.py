@@ -19,13 +19,10 @@ from tesnet.geometry import Gripper, Part
 from tesnet.obstacles import Obstacles
 from tesnet.points import points_in_grasp_frames
 from tesnet.swept import inside_hand, reach_of
-from tesnet.visibility import depth_behind
+from tesnet.visibility import hidden
 
 APPROACH_DISTANCE = 0.05
 """Length of the straight approach that is kept clear of observed points, metres."""
-
-SHADOW_MARGIN = 0.01
-"""A place is hidden when it lies this far behind the surface that covers it."""
 
 BORDER = 0.005
 """Points this near to a side of the workspace are taken to be cut off by it: as far as prepared points are apart."""
@@ -154,7 +151,7 @@ def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper
         device=cloud.points.device,
     )
     places = samples @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
-    return (depth_behind(cloud, places) > SHADOW_MARGIN).any(dim=1)
+    return hidden(cloud, places).any(dim=1)
 
 
 def _samples(part: Part, width: float) -> list[tuple[float, float, float]]:

@@ -11,6 +11,23 @@ from torch import Tensor
 from tesnet.cloud import PreparedCloud
 from tesnet.ranges import range_image
 
+SHADOW_MARGIN = 0.01
+"""Metres: a place is hidden when it lies so far behind the surface that covers it."""
+
+FINE_SHADOW_MARGIN = 0.003
+"""The same where the cloud's cells are so fine that the surface stands at its place."""
+
+
+def hidden(cloud: PreparedCloud, places: Tensor, margin: float = SHADOW_MARGIN) -> Tensor:
+    """Mask (...) of the places (..., 3) of which observed points block the sight of every viewpoint.
+
+    Args:
+        cloud: what was observed.
+        places: anywhere.
+        margin: a place no deeper than this behind what covers it counts as seen, metres.
+    """
+    return depth_behind(cloud, places) > margin
+
 
 def depth_behind(cloud: PreparedCloud, places: Tensor) -> Tensor:
     """How far places (..., 3) lie behind the surface that covers them, seen from the viewpoint that sees them best.

@@ -5,12 +5,14 @@ Shared by the networks that look there and nowhere else, with the preparation th
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
 from tesnet.cloud import PreparationConfig, PreparedCloud
+from tesnet.networks.network import mirror_factors
 from tesnet.points import points_in_grasp_frames
 
 FINE = PreparationConfig(voxel_size=0.0025, normal_neighbours=40, graph_neighbours=1)
@@ -59,13 +61,6 @@ class Members:
     point: Tensor
     total: Tensor
 
-    def up_to(self, count: int) -> Members:
-        """The first `count` members of each box."""
-        first = self.total.cumsum(0) - self.total
-        rank = torch.arange(len(self.row), device=self.row.device) - first[self.row]
-        kept = rank < count
-        return Members(self.row[kept], self.point[kept], self.total.clamp(max=count))
-
     def table(self, count: int) -> Tensor:
         """(C, count) indices of the first `count` members of each box, repeated from the start where there are fewer.
 
@@ -77,6 +72,27 @@ class Members:
         place = torch.arange(count, device=self.row.device) % self.total.clamp(min=1)[:, None]
         index = self.point[(first[:, None] + place).clamp(max=len(self.point) - 1)]
         return index * (self.total > 0)[:, None]
+
+
+def judged_in_parts(
+    judge: Callable[[PreparedCloud, Tensor, Tensor], Tensor],
+    cloud: PreparedCloud,
+    poses: Tensor,
+    mirror: Tensor | None,
+    at_once: int,
+) -> Tensor:
+    """Logits (C,) of the poses (C, 4, 4), of at most `at_once` at a time, so that memory does not grow with C.
+
+    Args:
+        judge: gives the logits of some poses, and of the signs of their mirror.
+        cloud: that the poses are in.
+        poses: of the hands.
+        mirror: (C,) as `Network.score` takes it.
+        at_once: poses in memory.
+    """
+    signs = torch.ones(len(poses), device=poses.device) if mirror is None else mirror
+    parts = zip(poses.split(at_once), signs.split(at_once), strict=True)
+    return torch.cat([judge(cloud, *part) for part in parts])
 
 
 def members_of(points: Tensor, poses: Tensor, box: Box) -> Members:
@@ -105,7 +121,7 @@ def seen_from_hand(
     """
     rotation = poses[:, :3, :3]
     if mirror is not None:
-        rotation = rotation * torch.stack([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], dim=1)[:, None]
+        rotation = rotation * mirror_factors(mirror)[:, None]
     rotation, origin = rotation[row], poses[row, :3, 3]
     positions = ((cloud.points[point] - origin)[:, None] @ rotation)[:, 0]
     normals = (cloud.normals[point][:, None] @ rotation)[:, 0]

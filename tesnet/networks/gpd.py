@@ -20,8 +20,9 @@ from torch import Tensor, nn
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import PANDA
-from tesnet.networks.closing import FINE, Box, members_of, seen_from_hand
-from tesnet.visibility import depth_behind
+from tesnet.networks.closing import FINE, Box, judged_in_parts, members_of, seen_from_hand
+from tesnet.networks.network import mirror_factors
+from tesnet.visibility import FINE_SHADOW_MARGIN, hidden
 
 REGION = Box(breadth=0.02, length=0.055, behind=-PANDA.palm_front, ahead=PANDA.tip_offset + 0.01)
 """The hand's closing region and its fingers, from the palm to 1 cm before the tips."""
@@ -33,9 +34,6 @@ CHANNELS_PER_VIEW = 5
 PIXELS = 24
 _PLACES = 12
 """Places along each axis that are looked for in the camera's shadow; two pixels each."""
-
-_HIDDEN = 0.003
-"""Metres behind the observed surface from which on a place counts as unseen."""
 
 _CANDIDATES_AT_ONCE = 250
 
@@ -78,10 +76,11 @@ class GPD(nn.Module):
         self, features: None, cloud: PreparedCloud, candidates: Candidates, mirror: Tensor | None = None
     ) -> Tensor:
         """Logits (C,)."""
-        poses = candidates.Ts_canonical_grasp
-        signs = torch.ones(len(poses), device=poses.device) if mirror is None else mirror
-        parts = zip(poses.split(_CANDIDATES_AT_ONCE), signs.split(_CANDIDATES_AT_ONCE), strict=True)
-        return torch.cat([self.layers(images(cloud, *part))[:, 0] for part in parts])
+        return judged_in_parts(self._judge, cloud, candidates.Ts_canonical_grasp, mirror, _CANDIDATES_AT_ONCE)
+
+    def _judge(self, cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
+        logits: Tensor = self.layers(images(cloud, poses, mirror))[:, 0]
+        return logits
 
 
 def images(cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
@@ -96,8 +95,8 @@ def images(cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
         mirror: (C,) +1, or -1 for an image of the surroundings reflected in the hand's plane.
     """
     observed = _observed(cloud, poses, mirror)
-    hidden = _hidden(cloud, poses, mirror)
-    return torch.cat([observed, hidden], dim=2).flatten(1, 2)
+    unseen = _unseen(cloud, poses, mirror)
+    return torch.cat([observed, unseen], dim=2).flatten(1, 2)
 
 
 def _observed(cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
@@ -115,14 +114,13 @@ def _observed(cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
     return means.view(len(poses), len(VIEWS), PIXELS, PIXELS, CHANNELS_PER_VIEW - 1).permute(0, 1, 4, 2, 3)
 
 
-def _hidden(cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
+def _unseen(cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
     """(C, 3, 1, PIXELS, PIXELS) average height of the places in each pixel's column that the camera could not see."""
     steps = (torch.arange(_PLACES, device=poses.device) + 0.5) / _PLACES
     share = torch.stack(torch.meshgrid(steps, steps, steps, indexing="ij"), dim=-1).view(-1, 3)
     local = REGION.low.to(poses.device) + share * REGION.size.to(poses.device)
-    flip = torch.stack([mirror, torch.ones_like(mirror), torch.ones_like(mirror)], dim=1)
-    places = (local * flip[:, None]) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
-    is_hidden = (depth_behind(cloud, places) > _HIDDEN).view(-1, _PLACES, _PLACES, _PLACES).float()
+    places = (local * mirror_factors(mirror)[:, None]) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
+    is_hidden = hidden(cloud, places, FINE_SHADOW_MARGIN).view(-1, _PLACES, _PLACES, _PLACES).float()
     views = []
     for along, _, _ in VIEWS:
         column = is_hidden.movedim(along + 1, 3)  # rows and columns keep their order

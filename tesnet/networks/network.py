@@ -62,6 +62,16 @@ class Network(Protocol):
     def load_state_dict(self, state_dict: Mapping[str, Any]) -> Any: ...  # noqa: D102
 
 
+def mirror_factors(mirror: Tensor) -> Tensor:
+    """(C, 3) factors of x, y and z in the grasp frame: those of a reflection in the hand's plane where `mirror` is -1.
+
+    Args:
+        mirror: (C,) +1 or -1, as `Network.score` takes it.
+    """
+    one = torch.ones_like(mirror)
+    return torch.stack([mirror, one, one], dim=1)
+
+
 def encode(network: Network, cloud: PreparedCloud) -> Any:
     """What `network.score` needs of one cloud."""
     return network.encode_batch([cloud])[0]

@@ -22,7 +22,7 @@ from torch import Tensor, nn
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import PANDA
-from tesnet.networks.closing import FINE, Box, members_of, seen_from_hand
+from tesnet.networks.closing import FINE, Box, judged_in_parts, members_of, seen_from_hand
 
 REGION = Box(
     breadth=0.012,
@@ -74,10 +74,7 @@ class PointNetGPD(nn.Module):
         self, features: None, cloud: PreparedCloud, candidates: Candidates, mirror: Tensor | None = None
     ) -> Tensor:
         """Logits (C,): PointNet's maximum over h(p) for each p of the region (arXiv 1612.00593, equation 1)."""
-        poses = candidates.Ts_canonical_grasp
-        signs = torch.ones(len(poses), device=poses.device) if mirror is None else mirror
-        parts = zip(poses.split(_CANDIDATES_AT_ONCE), signs.split(_CANDIDATES_AT_ONCE), strict=True)
-        return torch.cat([self._judge(cloud, *part) for part in parts])
+        return judged_in_parts(self._judge, cloud, candidates.Ts_canonical_grasp, mirror, _CANDIDATES_AT_ONCE)
 
     def _judge(self, cloud: PreparedCloud, poses: Tensor, mirror: Tensor) -> Tensor:
         members = members_of(cloud.points, poses, REGION)

@@ -19,6 +19,7 @@ from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.layers import PointTransformerConv, SAGEConv
+from tesnet.networks.network import mirror_factors
 from tesnet.patches import Patches, group, pool
 from tesnet.points import points_in_grasp_frames
 from tesnet.visibility import depth_behind, outside
@@ -239,7 +240,7 @@ class RegionPooling(nn.Module):
 
         Turning each candidate's weights is cheaper than turning all points in its box.
         """
-        rotation = poses[:, :3, :3] * _mirror(sign)[:, None]
+        rotation = poses[:, :3, :3] * mirror_factors(sign)[:, None]
         points, normals, facing = self.geometry.weight.T.split([3, 3, 1])
         turned = rotation @ (points / _LENGTH)
         weight = torch.cat([turned, rotation @ normals, facing.expand(len(poses), -1, -1)], dim=1)
@@ -300,7 +301,7 @@ def _candidate_inputs(
     """
     poses = candidates.Ts_canonical_grasp
     rotation = poses[:, :3, :3]
-    flip = _mirror(sign)
+    flip = mirror_factors(sign)
     pair = ((cloud.points[candidates.contact] - cloud.points[candidates.approach])[:, None] @ rotation)[:, 0]
     normal = (cloud.normals[candidates.approach][:, None] @ rotation)[:, 0] * flip
     sight = (cloud.view_directions[candidates.approach][:, None] @ rotation)[:, 0] * flip
@@ -315,11 +316,6 @@ def _candidate_inputs(
     places = ends @ rotation.transpose(1, 2) + poses[:, None, :3, 3]
     out = (outside(cloud, places) / _LENGTH).clamp(-2, 2)
     return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height, out], 1)
-
-
-def _mirror(sign: Tensor) -> Tensor:
-    """(C, 3) factors of x, y and z that mirror in the hand's plane where the sign (C,) is -1."""
-    return torch.stack([sign, torch.ones_like(sign), torch.ones_like(sign)], dim=1)
 
 
 def _ends(hand: Gripper) -> Tensor:
@@ -352,6 +348,6 @@ def _probes(hand: Gripper) -> Tensor:
 
 def _probe_inputs(probes: Tensor, cloud: PreparedCloud, poses: Tensor, sign: Tensor) -> Tensor:
     """(C, 2 S): how far the probes (S, 3) lie behind what the camera saw, on a coarse and on a fine scale."""
-    places = (_mirror(sign)[:, None] * probes) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
+    places = (mirror_factors(sign)[:, None] * probes) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
     behind = depth_behind(cloud, places) / _LENGTH
     return torch.cat([behind.clamp(-2, 3), (4 * behind).clamp(-1, 1)], dim=1)

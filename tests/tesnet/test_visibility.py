@@ -9,7 +9,7 @@ import torch
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Box
-from tesnet.visibility import depth_behind, outside
+from tesnet.visibility import FINE_SHADOW_MARGIN, SHADOW_MARGIN, depth_behind, hidden, outside
 from tests.tesnet.scenes import CAMERA, UP, WORKSPACE, ask, prepared, tabletop
 
 
@@ -37,11 +37,18 @@ def test_depth_is_measured_from_the_surface_in_the_line_of_sight() -> None:
 
 def test_a_place_that_one_of_two_viewpoints_sees_is_not_hidden() -> None:
     cloud = wall()
-    hidden = places(cloud, [[0.0, 0.0, -0.05]])
-    assert float(depth_behind(cloud, hidden)) > 0.04
+    behind = places(cloud, [[0.0, 0.0, -0.05]])
+    assert float(depth_behind(cloud, behind)) > 0.04
     from_below = places(cloud, [[0.0, 0.0, -0.5]])
     both = replace(cloud, viewpoints=torch.cat([cloud.viewpoints, from_below]))
-    assert float(depth_behind(both, hidden)) < -0.04
+    assert float(depth_behind(both, behind)) < -0.04
+
+
+@pytest.mark.parametrize("margin", [SHADOW_MARGIN, FINE_SHADOW_MARGIN])
+def test_hidden_is_what_lies_deeper_than_the_margin(margin: float) -> None:
+    cloud = wall()
+    shallow, deep, beside = [0, 0, 0.002 - margin], [0, 0, -0.002 - margin], [0.2, 0, -0.05]
+    assert hidden(cloud, places(cloud, [shallow, deep, beside]), margin).tolist() == [False, True, False]
 
 
 def test_how_far_outside_is_the_distance_from_the_nearest_side_of_the_workspace() -> None:

@@ -8,7 +8,7 @@ import torch
 from tesnet import candidates
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
-from tesnet.networks.closing import Box, members_of, seen_from_hand
+from tesnet.networks.closing import Box, judged_in_parts, members_of, seen_from_hand
 from tests.tesnet.scenes import prepared, tabletop_query
 
 BOX = Box(breadth=0.012, length=0.05, behind=0.04, ahead=0.015)
@@ -76,3 +76,21 @@ def test_points_are_seen_in_the_grasp_frame_and_mirrored_where_asked_for() -> No
         np.testing.assert_allclose(positions[members.row == row], local, atol=1e-6)
         turned = ready.normals[mine].double().numpy() @ rotation * mirror
         np.testing.assert_allclose(normals[members.row == row], turned, atol=1e-5)
+
+
+def test_parts_are_judged_with_their_own_signs_and_put_together_in_order() -> None:
+    ready, found = example()
+    sign = torch.where(torch.arange(len(found)) % 3 == 0, 1.0, -1.0)
+    sizes = []
+
+    def judge(cloud: PreparedCloud, poses: torch.Tensor, mirror: torch.Tensor) -> torch.Tensor:
+        assert cloud is ready
+        sizes.append(len(poses))
+        return poses[:, 0, 3] * mirror
+
+    logits = judged_in_parts(judge, ready, found.Ts_canonical_grasp, sign, 20)
+    torch.testing.assert_close(logits, found.Ts_canonical_grasp[:, 0, 3] * sign)
+    assert max(sizes) <= 20
+    assert sum(sizes) == len(found) > 20
+    unmirrored = judged_in_parts(judge, ready, found.Ts_canonical_grasp, None, 20)
+    torch.testing.assert_close(unmirrored, found.Ts_canonical_grasp[:, 0, 3])
