@@ -156,6 +156,7 @@ _PLAIN_OPTIONS = (
     "num_approach_points",
     "max_candidates",
     "unseen",
+    "calibrate",
     "pregrasp_distance",
     "frame_convention",
     "seed",
@@ -290,6 +291,12 @@ def _parser() -> argparse.ArgumentParser:
         "hand and what differs",
     )
     add("--unseen", choices=("free", "occupied"), help="the shadow behind observed points, for collisions")
+    add(
+        "--calibrate",
+        action="store_true",
+        default=None,
+        help="solve depth scale and tilt from the support seen; needs --viewpoint, --up and --support-height",
+    )
     add("--pregrasp-distance", type=_number, metavar="M", help="how far behind the grasp the pregrasp lies")
     add("--frame-convention", choices=FRAME_CONVENTIONS, help="axes and origin of the printed poses")
     add("--seed", type=int, metavar="N", help="makes sampling repeatable")

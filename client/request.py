@@ -137,6 +137,7 @@ class GraspOptions(TypedDict, total=False):
         max_candidates: search effort (default 2000).
         gripper: a known hand's name, as `tesnet.hands` has them (default `"franka"`), or `{"max_width": 0.06, ...}`.
         unseen: whether the shadow behind observed points is `"free"` (default) or `"occupied"` for collisions.
+        calibrate: whether depth scale and a small tilt are solved from the support that is seen (default False).
         pregrasp_distance: how far behind the grasp `pregrasp` lies (default 0.05).
         frame_convention: `"panda"` (default), `"graspnet"` or `"contact_graspnet"`.
         seed: makes sampling repeatable (default 0).
@@ -156,6 +157,7 @@ class GraspOptions(TypedDict, total=False):
     max_candidates: int
     gripper: str | GripperSize
     unseen: Literal["free", "occupied"]
+    calibrate: bool
     pregrasp_distance: float
     frame_convention: FrameConvention
     seed: int

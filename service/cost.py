@@ -66,9 +66,10 @@ def _points_work(query: GraspQuery) -> float:
 def _options_work(query: GraspQuery) -> float:
     views = 1 if query.viewpoints is None else len(query.viewpoints)
     shadows = 2 if query.unseen == "occupied" else 1
-    plane = 0.05 if query.support_height == "auto" else 0.0
+    plane = 0.05 if query.support_height == "auto" or isinstance(query.up, str) else 0.0
+    corrections = 0.05 * views if query.calibrate else 0.0
     search = 2.5e-4 * query.num_approach_points + 4e-5 * query.max_candidates
-    return 0.015 + search + 2.5e-3 * views * shadows + plane
+    return 0.015 + search + 2.5e-3 * views * shadows + plane + corrections
 
 
 def _kind(query: GraspQuery) -> Kind:

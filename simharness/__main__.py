@@ -14,6 +14,7 @@ import signal
 import sys
 from collections.abc import Sequence
 from contextlib import ExitStack
+from dataclasses import replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
@@ -50,6 +51,9 @@ if TYPE_CHECKING:
 EXIT_USAGE = 2
 EXIT_BROKEN = 3
 
+PUBLISHED_CROP = "published-crop"
+"""Folder, in that of a run of camera `giga`, of the same rounds with the crop that its published figures have."""
+
 
 def main(arguments: Sequence[str] | None = None) -> int:
     """Carry out a command line; the exit code."""
@@ -74,7 +78,12 @@ def _fail(error: SimError, code: int) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
-    _, code = _clear(options, settings, RunFolder(out_of(options, settings)))
+    folder = RunFolder(out_of(options, settings))
+    _, code = _clear(options, settings, folder)
+    if settings.calibrate and options.calibrate is None and not code:
+        print(f"\n{PUBLISHED_CROP}: the same rounds without the table in view, as published", flush=True)
+        settings = replace(settings, calibrate=False)
+        _, code = _clear(options, settings, RunFolder(folder.path / PUBLISHED_CROP))
     return code
 
 

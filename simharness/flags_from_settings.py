@@ -49,6 +49,8 @@ def settings_of(options: argparse.Namespace) -> RunSettings:
     given = {name: getattr(options, name) for name in flags()}
     given["objects"] = given["objects"] or DEFAULT_OBJECTS[options.scene]
     given |= {name: _absolute(given[name]) for name in ("objects", "exclude", "only")}
+    if options.camera == "giga" and options.calibrate is None:
+        given["calibrate"] = True
     return RunSettings(seeds=seeds, max_grasps=MAX_GRASPS_WATCHED if options.watch else 1, **given)
 
 

@@ -11,7 +11,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from tesnet import candidates, cloud, collision, networks, plausibility, ranking, support, weights
+from tesnet import calibration, candidates, cloud, collision, networks, plausibility, ranking, support, weights
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box, GraspSet, Pose
 from tesnet.networks import Network
@@ -175,8 +175,9 @@ class GraspPredictor:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""
         clock = _Clock(give_up)
         rejected = dict.fromkeys(REJECTIONS, 0)
+        query, corrected = calibration.calibrated(query)
         query, plane, said = support.settled(query)
-        notes = [*_query_warnings(query), *said, *_support_warnings(query)]
+        notes = [*_query_warnings(query), *corrected, *said, *_support_warnings(query)]
 
         clock.check()
         prepared = cloud.prepare(query, self._preparation, self.device, plane)

@@ -62,6 +62,7 @@ class GraspQuery:
         model: the network that shall answer, where several are loaded; None for the first of them.
         view_index: (N,) which of the viewpoints saw each point, from 0; turns normals.
         normals: (N, 3) outward, of any length, a row of zeros where there is none; turn ours.
+        calibrate: whether each view's depth scale and a small tilt are solved from the support that it sees.
         origin: (3,) of this query's frame in that of the caller, whose axes are the same; None where they are one.
         ignored_points: how many were posted that are not finite and not among `points`.
         notes: what the caller is to be told about how these points came to be.
@@ -89,6 +90,7 @@ class GraspQuery:
     model: str | None = None
     view_index: NDArray[np.uint8] | None = None
     normals: NDArray[np.float32] | None = None
+    calibrate: bool = False
     origin: NDArray[np.float64] | None = None
     ignored_points: int = 0
     notes: tuple[str, ...] = ()
@@ -134,8 +136,8 @@ class GraspQuery:
         _whole_in_range("num_approach_points", self.num_approach_points, 1, MAX_APPROACH_POINTS)
         _whole_in_range("max_candidates", self.max_candidates, 1, MAX_CANDIDATES)
         _whole_in_range("seed", self.seed, 0, MAX_SEED)
-        if self.unseen not in ("free", "occupied"):
-            raise InvalidQuery("unseen", f"is {self.unseen!r}; valid: free, occupied")
+        _one_of("unseen", self.unseen, "free", "occupied")
+        _one_of("calibrate", self.calibrate, True, False)
 
     @property
     def offset(self) -> NDArray[np.float64]:
@@ -333,6 +335,11 @@ def _in_range(field: str, value: Any, low: float, high: float, unit: str = "") -
         )
     if not low <= value <= high:
         raise InvalidQuery(field, f"is {value:g}; it must lie between {low:g} and {high:g}{unit}")
+
+
+def _one_of(field: str, value: Any, *valid: Any) -> None:
+    if value not in valid:
+        raise InvalidQuery(field, f"is {value!r}; valid: {', '.join(map(str, valid))}")
 
 
 def _whole_in_range(field: str, value: Any, low: int, high: int) -> None:

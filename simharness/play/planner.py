@@ -36,6 +36,7 @@ class HttpPlanner:
         max_grasps: grasps wanted for each observation.
         transport: replaces the network, for tests.
         gripper: name of the hand to ask for.
+        calibrate: whether the service shall calibrate by the table in view.
 
     Raises:
         UsageError: a URL that is not http or https.
@@ -49,6 +50,7 @@ class HttpPlanner:
         transport: httpx.BaseTransport | None = None,
         *,
         gripper: str = DEFAULT_HAND,
+        calibrate: bool = False,
     ) -> None:
         try:
             self._client = GraspClient(url, timeout=REQUEST_TIMEOUT_S, transport=transport)
@@ -57,6 +59,7 @@ class HttpPlanner:
         self._url = url
         self._model = model
         self._max_grasps = max_grasps
+        self._calibrate = calibrate
         # Older services know no hand by name.
         self._hand: dict[str, Any] = {} if gripper == DEFAULT_HAND else {"gripper": gripper}
 
@@ -81,7 +84,7 @@ class HttpPlanner:
         if not len(observation.points_world):
             return Plan.nothing("no_points_in_workspace")
         start = time.perf_counter()
-        options = _options(query_about(observation, seed)) | self._hand
+        options = _options(query_about(observation, seed, calibrate=self._calibrate)) | self._hand
         try:
             reply = self._client.grasps(
                 observation.points_world,
@@ -119,6 +122,7 @@ def _options(query: GraspQuery) -> dict[str, Any]:
     """What a query of the protocol tells of its cloud, by the names of the wire."""
     box = query.workspace
     return {
+        "calibrate": query.calibrate or None,  # older services do not know it
         "viewpoint": query.viewpoints,
         "up": query.up,
         "support_height": query.support_height,

@@ -261,7 +261,7 @@ class _Table:
             rng,
             self._sensor,
             stand=self._stand,
-            table_in_view=bool(self._settings.table_in_view),
+            table_in_view=self._settings.shows_table,
             voxel_size=self._settings.voxel_size,
             segmentation=self._segmentation,
         )

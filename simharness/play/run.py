@@ -170,7 +170,7 @@ def _play(
     with ExitStack() as stack:
         service = stack.enter_context(LocalService(settings.model, log.service_log)) if url is None else None
         address = service.url if service is not None else str(url)
-        with HttpPlanner(address, settings.model, settings.max_grasps, gripper=settings.gripper) as planner:
+        with _planner(address, settings) as planner:
             model, document = planner.model()
         log.open(model, Serving(url, NUM_THREADS if service is not None else None, document.get("device")))
         # On a cluster nobody reaches this machine's service, so workers there have their own.
@@ -178,6 +178,12 @@ def _play(
         rounds = stack.enter_context(crew(task, min(workers, len(todo)), ray))
         for message in _messages(rounds, todo, service):
             log.take(message)
+
+
+def _planner(url: str, settings: RunSettings) -> HttpPlanner:
+    return HttpPlanner(
+        url, settings.model, settings.max_grasps, gripper=settings.gripper, calibrate=bool(settings.calibrate)
+    )
 
 
 @dataclass(frozen=True, slots=True)
@@ -211,11 +217,7 @@ class _Rounds:
         """
         photographer = Photographer(self.settings)
         with ExitStack() as stack:
-            planner = stack.enter_context(
-                HttpPlanner(
-                    self._service(stack), self.settings.model, self.settings.max_grasps, gripper=self.settings.gripper
-                )
-            )
+            planner = stack.enter_context(_planner(self._service(stack), self.settings))
             self._check(planner)
 
             def play(job: _RoundKey, emit: Emit) -> RoundRecord:

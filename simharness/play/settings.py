@@ -162,7 +162,16 @@ class RunSettings:
         ),
     ] = None
     table_in_view: Annotated[
-        bool | None, Flag("camera", "send the table too, not what stands on it alone (default: not)")
+        bool | None, Flag("camera", "send the table too, not what stands on it alone (default: with --calibrate alone)")
+    ] = None
+
+    calibrate: Annotated[
+        bool | None,
+        Flag(
+            "camera",
+            "have the service solve depth scale and tilt from the table in view (default: camera giga is played with "
+            "it and, beside it, with the published crop; others without)",
+        ),
     ] = None
 
     gripper: Annotated[
@@ -179,6 +188,11 @@ class RunSettings:
     def hand(self) -> KnownHand:
         """The hand that `gripper` names."""
         return HANDS[self.gripper]
+
+    @property
+    def shows_table(self) -> bool:
+        """Whether the table is in the clouds that are sent."""
+        return bool(self.calibrate if self.table_in_view is None else self.table_in_view)
 
     def to_json(self) -> dict[str, Any]:
         """The settings as JSON values."""

@@ -12,8 +12,17 @@ from tesnet.geometry import PANDA, Gripper
 from tesnet.query import GraspQuery
 
 
-def query_about(observation: Observation, seed: int = 0, gripper: Gripper = PANDA) -> GraspQuery:
-    """The cloud of an observation with all that the protocol tells of it; nothing else is changed from the defaults."""
+def query_about(
+    observation: Observation, seed: int = 0, gripper: Gripper = PANDA, *, calibrate: bool = False
+) -> GraspQuery:
+    """The cloud of an observation with all that the protocol tells of it; nothing else is changed from the defaults.
+
+    Args:
+        observation: with the table in view, if it is to calibrate.
+        seed: of the query.
+        gripper: of the query.
+        calibrate: of the query.
+    """
     return GraspQuery(
         observation.points_world,
         viewpoints=observation.viewpoints,
@@ -22,4 +31,5 @@ def query_about(observation: Observation, seed: int = 0, gripper: Gripper = PAND
         support_height=observation.table_height,
         gripper=gripper,
         seed=seed,
+        calibrate=calibrate,
     )

@@ -184,6 +184,7 @@ INVALID_OPTIONS: dict[str, tuple[str, Any, str]] = {
     "too many approach points": ("num_approach_points", 1025, "1024"),
     "too many candidates": ("max_candidates", 20001, "20000"),
     "unseen neither free nor occupied": ("unseen", "maybe", "occupied"),
+    "calibrate neither true nor false": ("calibrate", "often", "boolean"),
     "pregrasp_distance of two metres": ("pregrasp_distance", 2, "1"),
     "frame_convention unknown": ("frame_convention", "ros", "contact_graspnet"),
     "model that is not loaded": ("model", "edgegrasp", "tesnet"),

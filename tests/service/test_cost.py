@@ -24,6 +24,8 @@ PLAIN = GraspQuery(np.zeros((1000, 3), np.float32))
         {"viewpoints": np.ones((64, 3))},
         {"viewpoints": np.ones((64, 3)), "unseen": "occupied"},
         {"up": np.array([0, 0, 1.0]), "support_height": "auto"},
+        {"up": "auto"},
+        {"calibrate": True, "viewpoints": np.ones((4, 3)), "view_index": np.zeros(1000, np.uint8)},
     ],
 )
 def test_whoever_asks_for_more_should_take_longer(more: dict[str, object]) -> None:

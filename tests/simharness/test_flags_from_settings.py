@@ -43,7 +43,8 @@ def test_every_flag_reaches_its_setting_and_no_other(name: str) -> None:
         field.name for field in fields(RunSettings) if getattr(given, field.name) != getattr(nothing, field.name)
     }
     assert getattr(given, name) == value
-    assert changed == ({"scene", "objects"} if name == "scene" else {name})
+    # Other scenes have other objects; the camera that the flag is given here, the side view, calibrates.
+    assert changed == {"scene": {"scene", "objects"}, "camera": {"camera", "calibrate"}}.get(name, {name})
 
 
 def test_only_seeds_and_the_number_of_grasps_are_asked_for_otherwise() -> None:
@@ -59,6 +60,14 @@ def test_help_states_every_default() -> None:
         assert f"--{name.replace('_', '-')}" in text
         if flag.default is not None:
             assert f"(default {flag.default})" in text
+
+
+def test_the_side_view_calibrates_unless_told_otherwise() -> None:
+    assert asked("--camera", "giga").calibrate
+    assert asked("--camera", "giga").shows_table
+    assert not asked("--camera", "giga", "--no-calibrate").shows_table
+    assert not asked("--sensor", "dex").calibrate
+    assert not asked("--camera", "giga", "--no-table-in-view").shows_table
 
 
 def test_piles_are_made_of_other_objects_unless_some_are_named() -> None:

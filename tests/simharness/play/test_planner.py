@@ -98,6 +98,21 @@ def test_another_hand_is_asked_for_by_name() -> None:
     assert json.loads(rg2["gripper"][0]) == "rg2"
 
 
+def test_the_service_is_told_to_calibrate_where_that_is_wanted() -> None:
+    seen: list[httpx.Request] = []
+
+    def reply(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer(1))
+
+    for calibrate in (False, True):
+        with HttpPlanner("http://service.test", "tesnet", 1, httpx.MockTransport(reply), calibrate=calibrate) as asked:
+            asked.plan(observation(), seed=1)
+    plain, calibrating = (parse_qs(request.url.query.decode()) for request in seen)
+    assert "calibrate" not in plain  # older services know no such option
+    assert calibrating["calibrate"] == ["true"]
+
+
 def test_every_viewpoint_of_a_fused_cloud_is_sent() -> None:
     seen: list[httpx.Request] = []
 
