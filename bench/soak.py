@@ -94,8 +94,8 @@ def main() -> int:
     print(f"hostile {dict(sorted(hostile.statuses.items()))}")
     growth = last / first - 1
     print(
-        f"memory  {first:.1f} MB after the warm-up, {last:.1f} MB at the end: {100 * growth:+.2f} %; {highest:.0f} MB at "
-        "its highest"
+        f"memory  {first:.1f} MB after the warm-up, {last:.1f} MB at the end: {100 * growth:+.2f} %; {highest:.0f} MB "
+        "at its highest"
     )
     lost = sum(total.statuses.values()) - total.statuses[200]
     wrong = hostile.wrong + [f"{lost} honest requests got no grasps"] * bool(lost)

@@ -11,7 +11,9 @@ import math
 from collections.abc import Iterator
 from dataclasses import dataclass, replace
 
+import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
@@ -76,18 +78,25 @@ class Candidates:
         approach: (C,) indices of the approach points in the cloud.
         contact: (C,) indices of the contact points.
         Ts_canonical_grasp: (C, 4, 4) TCP poses: +z the direction of travel, +y the closing direction.
+        widths: (C,) metres between the fingers as they arrive there.
     """
 
     approach: Tensor
     contact: Tensor
     Ts_canonical_grasp: Tensor
+    widths: Tensor
 
     def __len__(self) -> int:
         return len(self.approach)
 
     def select(self, which: Tensor) -> Candidates:
         """The candidates at the indices (K,), or where the mask (C,) is true."""
-        return Candidates(self.approach[which], self.contact[which], self.Ts_canonical_grasp[which])
+        return Candidates(self.approach[which], self.contact[which], self.Ts_canonical_grasp[which], self.widths[which])
+
+    def openings(self, hand: Gripper) -> NDArray[np.float64]:
+        """(C,) the widths as the hand is told them: micrometres, and no wider than it opens."""
+        widths: NDArray[np.float64] = np.minimum(self.widths.cpu().double().numpy().round(6), hand.max_width)
+        return widths
 
     def joined_by(self, others: Candidates) -> Candidates:
         """These candidates, then the others of the same cloud."""
@@ -95,6 +104,7 @@ class Candidates:
             torch.cat([self.approach, others.approach]),
             torch.cat([self.contact, others.contact]),
             torch.cat([self.Ts_canonical_grasp, others.Ts_canonical_grasp]),
+            torch.cat([self.widths, others.widths]),
         )
 
 
@@ -147,9 +157,14 @@ def limits_for(hand: Gripper, config: CandidateConfig) -> CandidateConfig:
     )
 
 
+def wide_open(poses: Tensor, hand: Gripper) -> Tensor:
+    """The hand's largest opening for each of the poses (C, 4, 4): (C,) metres."""
+    return poses.new_full((len(poses),), hand.max_width)
+
+
 def _no_candidates(cloud: PreparedCloud) -> Candidates:
     nothing = torch.empty(0, dtype=torch.long, device=cloud.points.device)
-    return Candidates(nothing, nothing, cloud.points.new_empty(0, 4, 4))
+    return Candidates(nothing, nothing, cloud.points.new_empty(0, 4, 4), cloud.points.new_empty(0))
 
 
 def _search(
@@ -159,7 +174,7 @@ def _search(
     normals = contact_normals(cloud, config)
     approach, contact = pairs_in_reach(cloud.points, normals, approach_points, config)
     poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact], hand=query.gripper)
-    candidates = Candidates(approach, contact, poses)
+    candidates = Candidates(approach, contact, poses, wide_open(poses, query.gripper))
     return candidates, *_judge(cloud, query, config, candidates)
 
 
@@ -249,7 +264,7 @@ def _along_travel(
     reach = ((poses[:, :3, 3] - cloud.points[approach]) * travel).sum(dim=1) + hand.tip_offset
     lift = torch.where(reach - too_low >= _LEAST_REACH, too_low.clamp(min=0), 0.0)
     poses[:, :3, 3] -= lift[:, None] * travel
-    return Candidates(approach, contact, poses)
+    return Candidates(approach, contact, poses, wide_open(poses, hand))
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:

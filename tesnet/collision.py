@@ -14,6 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper, Part
 from tesnet.obstacles import Obstacles
@@ -40,7 +41,7 @@ _COARSE_STRIDE = 6
 
 def blocked(
     cloud: PreparedCloud,
-    Ts_canonical_grasp: Tensor,
+    candidates: Candidates,
     gripper: Gripper,
     unseen: Literal["free", "occupied"],
     between: Callable[[], None] = lambda: None,
@@ -51,50 +52,52 @@ def blocked(
 
     Args:
         cloud: what was observed.
-        Ts_canonical_grasp: (C, 4, 4) TCP poses.
+        candidates: C of them.
         gripper: the hand.
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
         between: called between blocks of work of some milliseconds.
     """
-    width = gripper.max_width
-    mask = in_collision(cloud.points, Ts_canonical_grasp, gripper, width, APPROACH_DISTANCE, between)
+    poses, widths = candidates.Ts_canonical_grasp, candidates.widths
+    mask = in_collision(cloud.points, poses, gripper, widths, APPROACH_DISTANCE, between)
     if cloud.unsought is not None:
-        mask |= _meets(cloud.unsought, Ts_canonical_grasp, gripper, ~mask, between)
-    unsafe = _meets(Obstacles.of(beyond(cloud)), Ts_canonical_grasp, gripper, ~mask, between)
+        mask |= _meets(cloud.unsought, candidates, gripper, ~mask, between)
+    unsafe = _meets(Obstacles.of(beyond(cloud)), candidates, gripper, ~mask, between)
     if not bool((mask | unsafe).all()):
         mask |= unsafe
     if unseen == "occupied":
-        mask |= in_shadow(cloud, Ts_canonical_grasp, gripper, width)
+        mask |= in_shadow(cloud, poses, gripper, widths)
     return mask
 
 
-def _meets(obstacles: Obstacles, poses: Tensor, gripper: Gripper, asked: Tensor, between: Callable[[], None]) -> Tensor:
-    """Mask (C,) of the poses (C, 4, 4), among those asked about, whose hand meets an obstacle on its way."""
+def _meets(
+    obstacles: Obstacles, candidates: Candidates, gripper: Gripper, asked: Tensor, between: Callable[[], None]
+) -> Tensor:
+    """Mask (C,) of the candidates, among those asked about (C,), whose hand meets an obstacle on its way."""
     met = torch.zeros_like(asked)
-    found = obstacles.count_in_hands(
-        poses[asked], gripper, gripper.max_width, distance=APPROACH_DISTANCE, between=between
-    )
+    poses, widths = candidates.Ts_canonical_grasp[asked], candidates.widths[asked]
+    found = obstacles.count_in_hands(poses, gripper, widths, distance=APPROACH_DISTANCE, between=between)
     met[asked] = found > 0
     return met
 
 
-def holds(posted: Tensor, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Tensor:
+def holds(posted: Tensor, candidates: Candidates, gripper: Gripper) -> Tensor:
     """Mask (C,): posted points lie well inside the open hand at the grasp, `HELD_POINTS` or more `HELD_DEPTH` deep.
 
     The last word on grasps that are to be returned: `blocked` looks at cells, and leaves out points that stand alone.
 
     Args:
         posted: (N, 3) every point of the query, its support's included.
-        Ts_canonical_grasp: (C, 4, 4) TCP poses.
+        candidates: C of them.
         gripper: the hand.
     """
-    if len(Ts_canonical_grasp) == 0:
+    if len(candidates) == 0:
         return torch.zeros(0, dtype=torch.bool, device=posted.device)
     low, high = reach_of(gripper, gripper.max_width, 0.0)
     radius = max(math.hypot(*corner) for corner in itertools.product(*zip(low, high, strict=True)))
-    origins = Ts_canonical_grasp[:, :3, 3]
+    poses = candidates.Ts_canonical_grasp
+    origins = poses[:, :3, 3]
     near = ((posted >= origins.amin(dim=0) - radius) & (posted <= origins.amax(dim=0) + radius)).all(dim=1)
-    held = Obstacles.of(posted[near]).count_in_hands(Ts_canonical_grasp, gripper, gripper.max_width, depth=HELD_DEPTH)
+    held = Obstacles.of(posted[near]).count_in_hands(poses, gripper, candidates.widths, depth=HELD_DEPTH)
     return held >= HELD_POINTS
 
 
@@ -102,7 +105,7 @@ def in_collision(
     points: Tensor,
     Ts_canonical_grasp: Tensor,
     gripper: Gripper,
-    width: float,
+    widths: Tensor | float,
     approach_distance: float,
     between: Callable[[], None] = lambda: None,
 ) -> Tensor:
@@ -112,21 +115,22 @@ def in_collision(
         points: (P, 3) that the hand shall not meet.
         Ts_canonical_grasp: (C, 4, 4) TCP poses.
         gripper: the hand.
-        width: opening of the fingers.
+        widths: openings of the fingers, (C,) or one for all.
         approach_distance: length of the straight approach, which ends in the grasp.
         between: called between blocks of work of some milliseconds.
     """
     hit = torch.zeros(len(Ts_canonical_grasp), dtype=torch.bool, device=points.device)
+    widths = torch.as_tensor(widths, dtype=points.dtype, device=points.device).expand(len(hit))
     # Most collisions show with a few points already; the others are looked for with all of them.
     for some in (points[::_COARSE_STRIDE], points):
         open_rows = (~hit).nonzero()[:, 0]
         for rows in open_rows.split(max(1, _BLOCK // max(1, len(some)))):
             between()
-            hit[rows] = _hit(some, Ts_canonical_grasp[rows], gripper, width, approach_distance)
+            hit[rows] = _hit(some, Ts_canonical_grasp[rows], gripper, widths[rows, None], approach_distance)
     return hit
 
 
-def _hit(points: Tensor, poses: Tensor, gripper: Gripper, width: float, approach_distance: float) -> Tensor:
+def _hit(points: Tensor, poses: Tensor, gripper: Gripper, width: Tensor, approach_distance: float) -> Tensor:
     x, y, z = points_in_grasp_frames(points, poses)
     return inside_hand(x, y, z, gripper, width, approach_distance).any(dim=1)
 
@@ -140,27 +144,27 @@ def beyond(cloud: PreparedCloud) -> Tensor:
     return places.reshape(-1, 3)
 
 
-def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, width: float) -> Tensor:
+def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, widths: Tensor | float) -> Tensor:
     """Mask (C,): part of the hand at the grasp lies where every viewpoint's sight is blocked by observed points.
 
-    The fingers and the palm's front are sampled.
+    The fingers and the palm's front are sampled, for hands open by `widths`, (C,) or one for all.
     """
     samples = torch.tensor(
-        [place for part in gripper.parts for place in _samples(part, width)],
+        [(*place, part.side / 2) for part in gripper.parts for place in _samples(part)],
         dtype=torch.float32,
         device=cloud.points.device,
     )
-    places = samples @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
+    local = samples[:, :3].repeat(len(Ts_canonical_grasp), 1, 1)
+    widths = torch.as_tensor(widths, device=local.device).expand(len(local))
+    local[:, :, 1] += widths[:, None] * samples[:, 3]
+    places = local @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
     return hidden(cloud, places).any(dim=1)
 
 
-def _samples(part: Part, width: float) -> list[tuple[float, float, float]]:
-    """Places in the middle plane of a finger, or 5 mm behind the front of the palm."""
+def _samples(part: Part) -> list[tuple[float, float, float]]:
+    """Places in the middle plane of a finger of the closed hand, or 5 mm behind the front of the palm."""
     if not part.side:
         return [(0.0, share * part.thickness.full / 2, part.front - 0.005) for share in (-0.9, -0.45, 0.0, 0.45, 0.9)]
     depths = [part.back + (part.front - part.back) * step / 4 for step in range(5)]
-    return [
-        (0.0, part.side * (width / 2 + share * part.thickness.at(part.front - z)), z)
-        for share in (0.1, 0.5, 0.9)
-        for z in depths
-    ]
+    shares = (0.1, 0.5, 0.9)
+    return [(0.0, part.side * share * part.thickness.at(part.front - z), z) for share in shares for z in depths]

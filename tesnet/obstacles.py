@@ -63,7 +63,7 @@ class Obstacles:
         self,
         poses: Tensor,
         gripper: Gripper,
-        width: float,
+        widths: Tensor | float,
         *,
         distance: float = 0.0,
         depth: float = 0.0,
@@ -74,7 +74,7 @@ class Obstacles:
         Args:
             poses: (C, 4, 4) TCP poses.
             gripper: the hand.
-            width: opening of the fingers.
+            widths: openings of the fingers, (C,) or one for all.
             distance: length of the straight way, ending in the pose, on which a point counts as in the hand.
             depth: only points at least so deep under the hand's surface count.
             between: called between blocks of work of some milliseconds.
@@ -82,7 +82,9 @@ class Obstacles:
         found = torch.zeros(len(poses), dtype=torch.long, device=poses.device)
         if len(self) == 0 or len(poses) == 0:
             return found
-        low, high = (torch.tensor(end, device=poses.device) for end in reach_of(gripper, width, distance))
+        widths = torch.as_tensor(widths, dtype=poses.dtype, device=poses.device).expand(len(poses))
+        widest = float(widths.max())
+        low, high = (torch.tensor(end, device=poses.device) for end in reach_of(gripper, widest, distance))
         for first in range(0, len(poses), _POSES_AT_ONCE):
             some = poses[first : first + _POSES_AT_ONCE]
             row, block = self._touching(some, low, high)
@@ -94,8 +96,9 @@ class Obstacles:
                 stop = max(begin + 1, int(torch.searchsorted(ends, done + _PAIRS_AT_ONCE, right=True)))
                 pose_of, points = self._pairs(row[begin:stop], block[begin:stop])
                 local = _in_grasp_frames(points, some[pose_of])
-                within = inside_hand(*local, gripper, width, distance, depth)
-                found.index_add_(0, first + pose_of, within.long())
+                row_of = first + pose_of
+                within = inside_hand(*local, gripper, widths[row_of], distance, depth)
+                found.index_add_(0, row_of, within.long())
                 begin = stop
                 between()
         return found

@@ -206,7 +206,7 @@ class GraspPredictor:
         clock.check()
         found, rejected = candidates.generate(prepared, query, self._candidates)
         clock.check()
-        blocked = collision.blocked(prepared, found.Ts_canonical_grasp, query.gripper, query.unseen, clock.check)
+        blocked = collision.blocked(prepared, found, query.gripper, query.unseen, clock.check)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
 
     def _encode(self, proposals: Sequence[_Proposal]) -> list[Any]:
@@ -232,8 +232,8 @@ class GraspPredictor:
         ranked = _ranked(found, scores, query)
         posted = torch.from_numpy(query.points.copy()).to(self.device)
         posted = cloud.in_canonical_frame(posted, prepared.T_cloud_canonical)
-        if bool(collision.holds(posted, found.free.Ts_canonical_grasp[ranked.indices], query.gripper).any()):
-            clear = ~collision.holds(posted, found.free.Ts_canonical_grasp, query.gripper)
+        if bool(collision.holds(posted, found.free.select(ranked.indices), query.gripper).any()):
+            clear = ~collision.holds(posted, found.free, query.gripper)
             found, scores = found.only(clear), scores[clear]
             ranked = _ranked(found, scores, query)
         last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
@@ -494,13 +494,13 @@ def _grasps(
     scores: torch.Tensor,
     indices: torch.Tensor,
 ) -> GraspSet:
-    """The candidates at the indices (M,), back in the frame of the caller, for a hand that is wide open."""
+    """The candidates at the indices (M,), back in the frame of the caller."""
     chosen = free.select(indices.to(scores.device))
     to_cloud = Pose(np.eye(3), query.offset) @ prepared.T_cloud_canonical
     return GraspSet(
         scores=scores[indices.to(scores.device)].cpu().double().numpy(),
         Ts_cloud_grasp=to_cloud.matrix @ chosen.Ts_canonical_grasp.cpu().double().numpy(),
-        widths=np.full(len(indices), query.gripper.max_width),
+        widths=chosen.openings(query.gripper),
         approach_points=to_cloud.apply(prepared.points[chosen.approach].cpu().numpy()),
         contact_points=to_cloud.apply(prepared.points[chosen.contact].cpu().numpy()),
         gripper=query.gripper,

@@ -12,7 +12,7 @@ from tesnet.geometry import Extent, Gripper, Part
 
 
 def inside_hand(
-    x: Tensor, y: Tensor, z: Tensor, gripper: Gripper, width: float, distance: float = 0.0, depth: float = 0.0
+    x: Tensor, y: Tensor, z: Tensor, gripper: Gripper, width: Tensor | float, distance: float = 0.0, depth: float = 0.0
 ) -> Tensor:
     """Mask of the places that lie in the hand.
 
@@ -21,7 +21,7 @@ def inside_hand(
         y: the same.
         z: the same.
         gripper: the hand.
-        width: opening of the fingers.
+        width: opening of the fingers, one number or one for each place, so shaped that it goes with `y`.
         distance: length of the straight way, ending in the grasp, on which a place counts as in the hand.
         depth: only places at least so deep under the surface of a part count, measured along the frame's axes.
     """
@@ -40,7 +40,9 @@ def reach_of(gripper: Gripper, width: float, distance: float) -> tuple[list[floa
     return [*low[:2].tolist(), float(low[2]) - distance], high.tolist()
 
 
-def _inside_part(part: Part, x: Tensor, y: Tensor, z: Tensor, width: float, distance: float, depth: float) -> Tensor:
+def _inside_part(
+    part: Part, x: Tensor, y: Tensor, z: Tensor, width: Tensor | float, distance: float, depth: float
+) -> Tensor:
     """Mask of the places (|x|, |y|, z) that a part passes.
 
     Swept along z, a tapered part is as wide at each place as where it comes to rest. The rounding of a finger's tip is

@@ -398,6 +398,7 @@ def _render_view(
     shown = LabelledView(
         cloud=prepared,
         pairs=pairs[near],
+        widths=torch.full((int(near.sum()),), query.gripper.max_width),
         approach=nearest[near, 0],
         contact=nearest[near, 1],
         outcomes=torch.from_numpy(view.outcomes.copy())[near],
@@ -405,6 +406,5 @@ def _render_view(
         scene=kind,
     )
     if view.collision_free is None:
-        poses = shown.candidates.Ts_canonical_grasp
-        return replace(shown, collision_free=~blocked(prepared, poses, query.gripper, query.unseen))
+        return replace(shown, collision_free=~blocked(prepared, shown.candidates, query.gripper, query.unseen))
     return replace(shown, collision_free=torch.from_numpy(view.collision_free.copy())[near])

@@ -279,7 +279,7 @@ def _label_view(
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
-    free = ~blocked(prepared, found.Ts_canonical_grasp, query.gripper, query.unseen)
+    free = ~blocked(prepared, found, query.gripper, query.unseen)
     chosen = _choose(prepared, found, free, config, rng, network)
     if len(chosen) == 0:
         return None
@@ -287,10 +287,11 @@ def _label_view(
     picked = found.select(which)
     Ts_world_grasp = prepared.T_cloud_canonical.matrix @ picked.Ts_canonical_grasp.double().numpy()
     with snapshot_of(world) as snapshot:
-        kinds = label_strict(world, hand, Ts_world_grasp, np.full(len(chosen), hand.gripper.max_width), snapshot)
+        kinds = label_strict(world, hand, Ts_world_grasp, picked.openings(hand.gripper), snapshot)
     return LabelledView(
         cloud=prepared,
         pairs=pairs_of(prepared, picked, hand.gripper),
+        widths=picked.widths,
         approach=picked.approach,
         contact=picked.contact,
         outcomes=torch.tensor([OUTCOME_KINDS.index(kind) for kind in kinds], dtype=torch.uint8),

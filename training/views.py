@@ -37,6 +37,7 @@ class LabelledView:
     Args:
         cloud: in its canonical frame.
         pairs: (C, 4, 3) approach point, contact point, and directions of closing and travel of each candidate.
+        widths: (C,) metres between the fingers as they arrived.
         approach, contact: (C,) the points of the cloud nearest to those of the pairs: where the cloud was rendered
             again, no point lies just there.
         outcomes: (C,) codes into `OUTCOME_KINDS`.
@@ -47,6 +48,7 @@ class LabelledView:
 
     cloud: PreparedCloud
     pairs: torch.Tensor
+    widths: torch.Tensor
     approach: torch.Tensor
     contact: torch.Tensor
     outcomes: torch.Tensor
@@ -57,9 +59,8 @@ class LabelledView:
     @property
     def candidates(self) -> Candidates:
         """The candidates with the poses that were tried."""
-        return Candidates(
-            self.approach, self.contact, poses_along(*self.pairs.unbind(dim=1), hand=HANDS[self.gripper].gripper)
-        )
+        poses = poses_along(*self.pairs.unbind(dim=1), hand=HANDS[self.gripper].gripper)
+        return Candidates(self.approach, self.contact, poses, self.widths)
 
     @property
     def success(self) -> torch.Tensor:
@@ -114,6 +115,7 @@ def save_scene(
             f"{number}/approach": view.approach.numpy().astype(np.uint16),
             f"{number}/contact": view.contact.numpy().astype(np.uint16),
             f"{number}/pairs": view.pairs.numpy(),
+            f"{number}/widths": view.widths.numpy(),
             f"{number}/outcomes": view.outcomes.numpy().astype(np.uint8),
             f"{number}/collision_free": view.collision_free.numpy(),
         }
@@ -153,6 +155,7 @@ def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
 
 def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     frame = json.loads(arrays[f"{number}/frame"].tobytes())
+    gripper = frame.get("gripper", "franka")
     if arrays[f"{number}/pairs"].shape[1:] != (4, 3):
         raise ValueError("its pairs have no directions of travel")
 
@@ -180,13 +183,21 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     return LabelledView(
         cloud=cloud,
         pairs=tensor("pairs", torch.float32),
+        widths=_widths(arrays, number, gripper),
         approach=tensor("approach", torch.long),
         contact=tensor("contact", torch.long),
         outcomes=tensor("outcomes", torch.uint8),
         collision_free=tensor("collision_free", torch.bool),
         scene=frame["scene"],
-        gripper=frame.get("gripper", "franka"),
+        gripper=gripper,
     )
+
+
+def _widths(arrays: Mapping[str, NDArray[Any]], number: int, gripper: str) -> torch.Tensor:
+    """Those of a view; hands were wide open before files told them."""
+    if f"{number}/widths" in arrays:
+        return torch.from_numpy(arrays[f"{number}/widths"])
+    return torch.full((len(arrays[f"{number}/outcomes"]),), HANDS[gripper].gripper.max_width)
 
 
 def scene_files(folders: Sequence[Path]) -> list[Path]:

@@ -10,7 +10,8 @@ import torch
 from numpy.typing import NDArray
 
 from tesnet import cloud
-from tesnet.geometry import Box, Pose
+from tesnet.candidates import Candidates, wide_open
+from tesnet.geometry import PANDA, Box, Pose
 from tesnet.networks.tesnet import TesNet, TesNetConfig
 from tesnet.points import nearest_neighbours
 from tesnet.predictor import GraspPredictor, ModelInfo, configuration_of
@@ -113,6 +114,12 @@ def prepared(query: GraspQuery, **changes: Any) -> cloud.PreparedCloud:
     found = cloud.prepare(query, cloud.PreparationConfig(**changes), CPU)
     assert found is not None
     return found
+
+
+def open_hands(poses: torch.Tensor) -> Candidates:
+    """Wide open Panda hands at TCP poses (C, 4, 4), of no particular pair of points."""
+    nowhere = torch.zeros(len(poses), dtype=torch.long)
+    return Candidates(nowhere, nowhere, poses, wide_open(poses, PANDA))
 
 
 def bare_cloud(points: Array, viewpoints: Array = CAMERA[None], **fields: Any) -> cloud.PreparedCloud:

@@ -8,7 +8,7 @@ from hypothesis import strategies as st
 
 from tesnet import candidates, collision
 from tesnet.geometry import PANDA, Pose
-from tests.tesnet.scenes import Array, bare_cloud, prepared, tabletop_query
+from tests.tesnet.scenes import Array, bare_cloud, open_hands, prepared, tabletop_query
 
 ROUNDING = 1e-6
 SWEEP = 0.05
@@ -123,9 +123,8 @@ def blocked_beside_the_side(*ys: float) -> list[bool]:
     """For hands whose TCPs lie at y, level with the strip; fingers close along y."""
     Ts = np.tile(np.eye(4), (len(ys), 1, 1))
     Ts[:, 1, 3] = ys
-    found: list[bool] = collision.blocked(
-        bare_cloud(STRIP, sides=SIDE), torch.from_numpy(Ts).float(), PANDA, "free"
-    ).tolist()
+    hands = open_hands(torch.from_numpy(Ts).float())
+    found: list[bool] = collision.blocked(bare_cloud(STRIP, sides=SIDE), hands, PANDA, "free").tolist()
     return found
 
 
@@ -149,8 +148,9 @@ def test_what_is_only_guessed_leaves_a_candidate() -> None:
 def test_the_shadow_blocks_where_it_counts_as_occupied() -> None:
     Ts = torch.from_numpy(HAND_ALONG_X[None]).float()
     Ts[0, 2, 3] = -0.3
-    assert not collision.blocked(bare_cloud(SQUARE, ABOVE[None]), Ts, PANDA, "free").any()
-    assert collision.blocked(bare_cloud(SQUARE, ABOVE[None]), Ts, PANDA, "occupied").all()
+    hands = open_hands(Ts)
+    assert not collision.blocked(bare_cloud(SQUARE, ABOVE[None]), hands, PANDA, "free").any()
+    assert collision.blocked(bare_cloud(SQUARE, ABOVE[None]), hands, PANDA, "occupied").all()
 
 
 # The shadow of a square of 20 x 20 cm at z = 0, spacing 4 mm, seen from straight above.

@@ -94,7 +94,9 @@ def test_the_closed_palm_is_covered_at_every_opening(name: str) -> None:
 def test_the_check_and_the_samples_hold_for_a_hand(name: str) -> None:
     hand = HANDS[name].gripper
     for width in (0.0, 0.6 * hand.max_width, hand.max_width):
-        samples = np.array([place for part in hand.parts for place in collision._samples(part, width)])
+        samples = np.concatenate(
+            [np.array(collision._samples(part)) + np.array([0.0, part.side * width / 2, 0.0]) for part in hand.parts]
+        )
         corners = hand.corners(width)
         assert (samples <= corners.max(axis=0) + 1e-9).all()
         assert (samples >= corners.min(axis=0) - 1e-9).all()

@@ -32,6 +32,7 @@ def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) 
     return LabelledView(
         cloud=ready,
         pairs=pairs_of(ready, found, PANDA),
+        widths=found.widths,
         approach=found.approach,
         contact=found.contact,
         outcomes=outcomes,

@@ -85,9 +85,8 @@ def surely_free(view: LabelledView) -> tuple[torch.Tensor, torch.Tensor]:
     """What the cloud leaves free, and where that holds however the file rounded the points (half a step of float16)."""
     generator = torch.Generator().manual_seed(0)
     noise = 2e-4 * torch.rand(16, *view.cloud.points.shape, generator=generator) - 1e-4
-    poses = view.candidates.Ts_canonical_grasp
     clouds = [replace(view.cloud, points=view.cloud.points + moved) for moved in noise]
-    votes = torch.stack([~blocked(cloud, poses, PANDA, "free") for cloud in clouds])
+    votes = torch.stack([~blocked(cloud, view.candidates, PANDA, "free") for cloud in clouds])
     return votes[0], (votes == votes[0]).all(dim=0)
 
 

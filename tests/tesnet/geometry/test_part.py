@@ -108,7 +108,7 @@ def test_the_collision_check_finds_what_lies_in_a_part(hand: Gripper, seed: int,
 def test_the_samples_for_the_shadow_lie_in_their_part(hand: Gripper, share: float) -> None:
     width = share * hand.max_width
     for part in hand.parts:
-        places = np.array(collision._samples(part, width))
+        places = np.array(collision._samples(part)) + np.array([0.0, part.side * width / 2, 0.0])
         assert depth(places, part, width).min() > -ROUNDING
         assert np.ptp(places, axis=0).max() > 0.8 * min(part.front - part.back, part.thickness.full)
 

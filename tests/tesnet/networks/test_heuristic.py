@@ -4,10 +4,9 @@ import numpy as np
 import pytest
 import torch
 
-from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.networks.heuristic import Heuristic, HeuristicConfig, antipodal_quality, verticality
-from tests.tesnet.scenes import bare_cloud
+from tests.tesnet.scenes import bare_cloud, open_hands
 
 DOWN = torch.tensor([[1.0, 0, 0, 0], [0, -1, 0, 0], [0, 0, -1, 0], [0, 0, 0, 1]])
 """A hand that comes straight down and closes along y."""
@@ -40,8 +39,7 @@ def test_a_hand_from_above_scores_best_and_half_a_turn_about_its_travel_changes_
     tilt = torch.eye(4)
     tilt[:3, :3] = torch.tensor([[0.8, 0, 0.6], [0, 1, 0], [-0.6, 0, 0.8]])
     turn = torch.diag(torch.tensor([-1.0, -1.0, 1.0, 1.0]))
-    index = torch.zeros(3, dtype=torch.long)
-    found = Candidates(index, index, torch.stack([DOWN, DOWN @ tilt, DOWN @ turn]))
+    found = open_hands(torch.stack([DOWN, DOWN @ tilt, DOWN @ turn]))
     assert verticality(cloud, found).tolist() == pytest.approx([1.0, 0.9, 1.0])
     logits = Heuristic(HeuristicConfig()).score(None, cloud, found)
     assert float(logits[0]) > float(logits[1])

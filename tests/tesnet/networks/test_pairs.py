@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+import dataclasses
+
 import numpy as np
 
 from tesnet import candidates
@@ -24,5 +26,5 @@ def test_a_pair_of_one_point_has_finite_features() -> None:
     cloud = prepared(tabletop_query())
     query = tabletop_query(max_candidates=5)
     found, _ = candidates.generate(cloud, query, candidates.CandidateConfig())
-    same = candidates.Candidates(found.approach, found.approach, found.Ts_canonical_grasp)
+    same = dataclasses.replace(found, contact=found.approach)
     np.testing.assert_allclose(pair_features(cloud, same)[:, :3], 0, atol=1e-6)
