@@ -79,19 +79,23 @@ class Candidates:
         contact: (C,) indices of the contact points.
         Ts_canonical_grasp: (C, 4, 4) TCP poses: +z the direction of travel, +y the closing direction.
         widths: (C,) metres between the fingers as they arrive there.
+        gripper: the hand of all of them.
     """
 
     approach: Tensor
     contact: Tensor
     Ts_canonical_grasp: Tensor
     widths: Tensor
+    gripper: Gripper
 
     def __len__(self) -> int:
         return len(self.approach)
 
     def select(self, which: Tensor) -> Candidates:
         """The candidates at the indices (K,), or where the mask (C,) is true."""
-        return Candidates(self.approach[which], self.contact[which], self.Ts_canonical_grasp[which], self.widths[which])
+        return Candidates(
+            self.approach[which], self.contact[which], self.Ts_canonical_grasp[which], self.widths[which], self.gripper
+        )
 
     def openings(self, hand: Gripper) -> NDArray[np.float64]:
         """(C,) the widths as the hand is told them: micrometres, and no wider than it opens."""
@@ -99,12 +103,13 @@ class Candidates:
         return widths
 
     def joined_by(self, others: Candidates) -> Candidates:
-        """These candidates, then the others of the same cloud."""
+        """These candidates, then the others of the same cloud and hand."""
         return Candidates(
             torch.cat([self.approach, others.approach]),
             torch.cat([self.contact, others.contact]),
             torch.cat([self.Ts_canonical_grasp, others.Ts_canonical_grasp]),
             torch.cat([self.widths, others.widths]),
+            self.gripper,
         )
 
 
@@ -118,7 +123,7 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
     if cloud.on_target is not None:
         allowed = allowed[cloud.on_target]
     if len(allowed) == 0:
-        return _no_candidates(cloud), {}
+        return _no_candidates(cloud, query.gripper), {}
     config = limits_for(query.gripper, config)
     generator = torch.Generator().manual_seed(query.seed)
     start = int(torch.randint(len(allowed), (1,), generator=generator))
@@ -162,9 +167,9 @@ def wide_open(poses: Tensor, hand: Gripper) -> Tensor:
     return poses.new_full((len(poses),), hand.max_width)
 
 
-def _no_candidates(cloud: PreparedCloud) -> Candidates:
+def _no_candidates(cloud: PreparedCloud, hand: Gripper) -> Candidates:
     nothing = torch.empty(0, dtype=torch.long, device=cloud.points.device)
-    return Candidates(nothing, nothing, cloud.points.new_empty(0, 4, 4), cloud.points.new_empty(0))
+    return Candidates(nothing, nothing, cloud.points.new_empty(0, 4, 4), cloud.points.new_empty(0), hand)
 
 
 def _search(
@@ -174,7 +179,7 @@ def _search(
     normals = contact_normals(cloud, config)
     approach, contact = pairs_in_reach(cloud.points, normals, approach_points, config)
     poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact], hand=query.gripper)
-    candidates = Candidates(approach, contact, poses, wide_open(poses, query.gripper))
+    candidates = Candidates(approach, contact, poses, wide_open(poses, query.gripper), query.gripper)
     return candidates, *_judge(cloud, query, config, candidates)
 
 
@@ -264,7 +269,7 @@ def _along_travel(
     reach = ((poses[:, :3, 3] - cloud.points[approach]) * travel).sum(dim=1) + hand.tip_offset
     lift = torch.where(reach - too_low >= _LEAST_REACH, too_low.clamp(min=0), 0.0)
     poses[:, :3, 3] -= lift[:, None] * travel
-    return Candidates(approach, contact, poses, wide_open(poses, hand))
+    return Candidates(approach, contact, poses, wide_open(poses, hand), hand)
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:

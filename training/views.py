@@ -59,8 +59,9 @@ class LabelledView:
     @property
     def candidates(self) -> Candidates:
         """The candidates with the poses that were tried."""
-        poses = poses_along(*self.pairs.unbind(dim=1), hand=HANDS[self.gripper].gripper)
-        return Candidates(self.approach, self.contact, poses, self.widths)
+        hand = HANDS[self.gripper].gripper
+        poses = poses_along(*self.pairs.unbind(dim=1), hand=hand)
+        return Candidates(self.approach, self.contact, poses, self.widths, hand)
 
     @property
     def success(self) -> torch.Tensor:

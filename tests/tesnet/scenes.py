@@ -119,7 +119,7 @@ def prepared(query: GraspQuery, **changes: Any) -> cloud.PreparedCloud:
 def open_hands(poses: torch.Tensor) -> Candidates:
     """Wide open Panda hands at TCP poses (C, 4, 4), of no particular pair of points."""
     nowhere = torch.zeros(len(poses), dtype=torch.long)
-    return Candidates(nowhere, nowhere, poses, wide_open(poses, PANDA))
+    return Candidates(nowhere, nowhere, poses, wide_open(poses, PANDA), PANDA)
 
 
 def bare_cloud(points: Array, viewpoints: Array = CAMERA[None], **fields: Any) -> cloud.PreparedCloud:

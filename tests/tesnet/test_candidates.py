@@ -14,6 +14,7 @@ from hypothesis import strategies as st
 from tesnet import candidates, cloud, collision
 from tesnet.candidates import CandidateConfig, Candidates
 from tesnet.geometry import PANDA
+from tesnet.hands import HANDS
 from tesnet.outline import Outline, outline
 from tesnet.query import ApproachCone
 from tests.tesnet.raycast import Bowl, Slab, overhead_query
@@ -251,6 +252,19 @@ def test_candidates_are_selected_by_index_and_by_mask() -> None:
     assert len(by_mask) == int(mask.sum())
     assert torch.equal(by_mask.Ts_canonical_grasp, by_index.Ts_canonical_grasp)
     assert torch.equal(by_mask.contact, found.contact[mask])
+
+
+def test_candidates_know_their_hand_and_keep_their_widths_when_selected_and_joined() -> None:
+    hand = HANDS["rg2"].gripper
+    found, _ = generate({"gripper": hand})
+    assert found.gripper == hand
+    assert torch.equal(found.widths, torch.full((len(found),), hand.max_width))
+    own = replace(found, widths=torch.arange(len(found)) / 1e3)
+    few = own.select(torch.tensor([3, 1]))
+    assert torch.equal(few.widths, torch.tensor([0.003, 0.001]))
+    joined = few.joined_by(own)
+    assert torch.equal(joined.widths, torch.cat([few.widths, own.widths]))
+    assert joined.gripper == few.gripper == hand
 
 
 def test_points_too_far_apart_make_no_pair() -> None:
