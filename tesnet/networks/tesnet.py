@@ -17,9 +17,10 @@ from torch import Tensor, nn
 
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
-from tesnet.geometry import PANDA, Gripper
 from tesnet.layers import PointTransformerConv, SAGEConv
+from tesnet.networks.around_hand import PROBES, Region, ends, probes, region_about
 from tesnet.networks.network import mirror_factors
+from tesnet.networks.told import TOLD_INPUTS, told_inputs
 from tesnet.patches import Patches, group, pool
 from tesnet.points import points_in_grasp_frames
 from tesnet.visibility import depth_behind, outside
@@ -44,9 +45,11 @@ class TesNetConfig:
         point_features, context_features: width of a point's and of the whole cloud's features.
         region_channels: widths of the shared MLP over the points in the hand's reach.
         head_channels: widths of the head's hidden layers.
-        closing_points, closing_region: at most so many points are looked at where the fingers close (`RegionPooling`).
+        closing_points, closing_region: at most so many points are looked at where the fingers close, in a region about
+            the open Franka hand (`region_about`).
         around_patches, around_region: the same for patches in the hand's wider surroundings.
         probe_channels: width of the layer over what the camera saw at the hand's probes.
+        told: whether it is told the hand and the cloud's noise (`told_inputs`). Without, it knows of them what it sees.
     """
 
     channels: int = 32
@@ -59,9 +62,10 @@ class TesNetConfig:
     head_channels: tuple[int, int] = (192, 96)
     probe_channels: int = 128
     closing_points: int = 56
-    closing_region: tuple[float, float, float, float] = (0.012, 0.045, 0.042, 0.012)
+    closing_region: Region = (0.012, 0.045, 0.042, 0.012)
     around_patches: int = 48
-    around_region: tuple[float, float, float, float] = (0.035, 0.085, 0.060, 0.045)
+    around_region: Region = (0.035, 0.085, 0.060, 0.045)
+    told: bool = False
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -78,8 +82,6 @@ class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
-    ends: Tensor
-    probes: Tensor
 
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()
@@ -98,10 +100,8 @@ class TesNet(nn.Module):
         self.contact = nn.Linear(f, config.head_channels[0], bias=False)
         self.pooled = nn.Linear(2 * config.region_channels[1], config.head_channels[0], bias=False)
         self.candidate = nn.Linear(_CANDIDATE_INPUTS, config.head_channels[0])
-        self.register_buffer("ends", _ends(PANDA), persistent=False)
-        self.register_buffer("probes", _probes(PANDA), persistent=False)
         self.hidden_space = nn.Sequential(
-            nn.Linear(2 * len(self.probes), config.probe_channels),
+            nn.Linear(2 * PROBES, config.probe_channels),
             nn.ReLU(),
             nn.Linear(config.probe_channels, config.head_channels[0], bias=False),
         )
@@ -112,6 +112,8 @@ class TesNet(nn.Module):
             nn.ReLU(),
             nn.Linear(config.head_channels[1], 1),
         )
+        if config.told:
+            self.told = Told(config)
 
     def encode_batch(self, clouds: Sequence[PreparedCloud]) -> list[CloudFeatures]:
         """Features of every point and of the whole of each cloud, in one pass over the stacked graphs of all of them.
@@ -157,17 +159,22 @@ class TesNet(nn.Module):
         """
         poses = candidates.Ts_canonical_grasp
         sign = torch.ones(len(poses), device=poses.device) if mirror is None else mirror
-        closing, num_closing = self.closing(features.points, cloud, poses, sign)
-        around, num_around = self.around(features.wide, features.patches, poses, sign)
-        totals = torch.stack([num_closing, num_around], dim=1)
+        at_fingers = self.closing.members(cloud.points, candidates)
+        near_hand = self.around.members(features.patches.points, candidates)
+        of_closing, of_around, of_head = self.told(cloud, candidates, at_fingers) if self.config.told else (None,) * 3
+        closing = self.closing(features.points, cloud, at_fingers, poses, sign, of_closing)
+        around = self.around(features.wide, features.patches, near_hand, poses, sign, of_around)
+        totals = torch.stack([at_fingers.total, near_hand.total], dim=1)
         joined = (
             self.pooled(torch.cat([closing, around], dim=1))
             + self.approach(features.points)[candidates.approach]
             + self.contact(features.points)[candidates.contact]
-            + self.candidate(_candidate_inputs(self.ends, cloud, candidates, totals, sign))
+            + self.candidate(_candidate_inputs(cloud, candidates, totals, sign))
             + self.situation(features.context)
-            + self.hidden_space(_probe_inputs(self.probes, cloud, poses, sign))
+            + self.hidden_space(_probe_inputs(cloud, candidates, sign))
         )
+        if of_head is not None:
+            joined = joined + of_head
         logits: Tensor = self.head(joined)[:, 0]
         return logits
 
@@ -193,6 +200,19 @@ class EncoderStage(nn.Module):
         return torch.relu(x + self.aggregate_norm(self.aggregate(attended, neighbours)))
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class RegionMembers:
+    """Points in each candidate's region.
+
+    Args:
+        index: (C, M) of them, the first repeated where there are fewer.
+        total: (C,) how many there are.
+    """
+
+    index: Tensor
+    total: Tensor
+
+
 class RegionPooling(nn.Module):
     """What lies in a box about each candidate's hand: a shared MLP over the points in it, then the largest of each.
 
@@ -200,40 +220,47 @@ class RegionPooling(nn.Module):
         in_channels: F, features of a point.
         channels: widths of the MLP.
         count: at most so many points are looked at; where more lie there, a fixed pseudo-random choice of them.
-        box: half extents along x and y of the grasp frame and extents along -z and +z from the TCP, metres.
+        region: where, about the open Franka hand.
     """
 
-    def __init__(
-        self, in_channels: int, channels: tuple[int, int], count: int, box: tuple[float, float, float, float]
-    ) -> None:
+    def __init__(self, in_channels: int, channels: tuple[int, int], count: int, region: Region) -> None:
         super().__init__()
         self.features = nn.Linear(in_channels, channels[0], bias=False)
         self.geometry = nn.Linear(_REGION_INPUTS, channels[0])
         self.update = nn.Linear(channels[0], channels[1])
         self.count = count
-        self.box = box
+        self.region = region
 
     def forward(
-        self, features: Tensor, cloud: PreparedCloud | Patches, poses: Tensor, sign: Tensor
-    ) -> tuple[Tensor, Tensor]:
-        """Pooled features (C, channels[1]) from features (P, F) of the points, and how many points are there, (C,).
+        self,
+        features: Tensor,
+        cloud: PreparedCloud | Patches,
+        members: RegionMembers,
+        poses: Tensor,
+        sign: Tensor,
+        shift: Tensor | None = None,
+    ) -> Tensor:
+        """Pooled features (C, channels[1]) from features (P, F) of the points.
 
         Args:
             features: of the cloud's points.
             cloud: P points with normals.
+            members: the points in each region.
             poses: (C, 4, 4) TCP poses.
             sign: (C,) +1, or -1 to see the surroundings mirrored in the hand's plane.
+            shift: (C, channels[0]) what a candidate adds to the first layer at each of its points.
         """
-        index, total = self.members(cloud.points, poses)
+        index = members.index
         facing = (cloud.normals * cloud.view_directions).sum(dim=1, keepdim=True)
         table = torch.cat([cloud.points, cloud.normals, facing], dim=1)
         flat = index.flatten()
         inputs = table.index_select(0, flat).view(*index.shape, _REGION_INPUTS)
         gathered = self.features(features).index_select(0, flat).view(*index.shape, self.features.out_features)
         weight, bias = self._geometry_of(poses, sign)
+        bias = bias if shift is None else bias + shift
         hidden = torch.relu(torch.baddbmm(gathered + bias[:, None], inputs, weight))
         pooled = torch.relu(self.update(hidden).amax(dim=1))
-        return pooled * (total > 0)[:, None], total
+        return pooled * (members.total > 0)[:, None]
 
     def _geometry_of(self, poses: Tensor, sign: Tensor) -> tuple[Tensor, Tensor]:
         """`geometry` for points and normals that are given in the cloud's frame: weights (C, 7, D) and biases (C, D).
@@ -246,17 +273,47 @@ class RegionPooling(nn.Module):
         weight = torch.cat([turned, rotation @ normals, facing.expand(len(poses), -1, -1)], dim=1)
         return weight, self.geometry.bias - (poses[:, None, :3, 3] @ turned)[:, 0]
 
-    def members(self, points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor]:
-        """Indices (C, M) of points in each candidate's box, the first repeated where there are fewer; totals (C,)."""
+    def members(self, points: Tensor, candidates: Candidates) -> RegionMembers:
+        """Those of the points (P, 3) in the candidates' regions."""
+        poses = candidates.Ts_canonical_grasp
         shuffled = torch.randperm(len(points), generator=torch.Generator().manual_seed(0)).to(poses.device)
         x, y, z = points_in_grasp_frames(points[shuffled], poses)
-        breadth, length, behind, ahead = self.box
-        within = (x.abs_() < breadth) & (y.abs_() < length) & (z > -behind) & (z < ahead)
+        breadth, length, behind, ahead = region_about(self.region, candidates)
+        within = (x.abs_() < breadth) & (y.abs_() < length[:, None]) & (z > -behind) & (z < ahead)
         rank = within.cumsum(dim=1, dtype=torch.int32)
         row, column = (within & (rank <= self.count)).nonzero(as_tuple=True)
         index = shuffled[within.to(torch.uint8).argmax(dim=1)][:, None].repeat(1, self.count)
         index[row, (rank[row, column] - 1).long()] = shuffled[column]
-        return index, rank[:, -1]
+        return RegionMembers(index, rank[:, -1])
+
+
+class Told(nn.Module):
+    """What a candidate's hand and the cloud's noise add to the first layers over its regions and of the head.
+
+    Nothing at first: trained weights of a network that was not told are good to begin with.
+    """
+
+    def __init__(self, config: TesNetConfig) -> None:
+        super().__init__()
+        self.widths = [config.region_channels[0], config.region_channels[0], config.head_channels[0]]
+        self.layer = nn.Linear(TOLD_INPUTS, sum(self.widths), bias=False)
+        nn.init.zeros_(self.layer.weight)
+
+    def forward(self, cloud: PreparedCloud, candidates: Candidates, at_fingers: RegionMembers) -> Sequence[Tensor]:
+        """(C, channels[0]) twice, for the points at the fingers and the patches about the hand; (C, head_channels[0]).
+
+        Args:
+            cloud: P points.
+            candidates: C grasps.
+            at_fingers: the points near the fingers.
+        """
+        poses = candidates.Ts_canonical_grasp
+        points = cloud.points.index_select(0, at_fingers.index.flatten()).view(*at_fingers.index.shape, 3)
+        between = (points - poses[:, None, :3, 3]) @ poses[:, :3, :3]
+        parts: Sequence[Tensor] = self.layer(told_inputs(cloud, candidates, between, at_fingers.total > 0)).split(
+            self.widths, dim=1
+        )
+        return parts
 
 
 def point_inputs(cloud: PreparedCloud) -> Tensor:
@@ -293,11 +350,9 @@ def edge_features(points: Tensor, normals: Tensor, neighbours: Tensor) -> Tensor
     )
 
 
-def _candidate_inputs(
-    ends: Tensor, cloud: PreparedCloud, candidates: Candidates, totals: Tensor, sign: Tensor
-) -> Tensor:
+def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tensor, sign: Tensor) -> Tensor:
     """(C, 23): the pair, numbers of points near, n_a, line of sight and up, all in the grasp frame, the height, and how
-    far the ends of the hand (7, 3) reach out of the workspace.
+    far the ends of the hand reach out of the workspace.
     """
     poses = candidates.Ts_canonical_grasp
     rotation = poses[:, :3, :3]
@@ -313,41 +368,15 @@ def _candidate_inputs(
         if cloud.support_height is not None:
             height[:, 0] = (poses[:, :3, 3] @ cloud.up - cloud.support_height) / (5 * _LENGTH)
             height[:, 1] = 1
-    places = ends @ rotation.transpose(1, 2) + poses[:, None, :3, 3]
+    places = ends(candidates.gripper).of(candidates) @ rotation.transpose(1, 2) + poses[:, None, :3, 3]
     out = (outside(cloud, places) / _LENGTH).clamp(-2, 2)
     return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height, out], 1)
 
 
-def _ends(hand: Gripper) -> Tensor:
-    """(7, 3) the TCP, and tips, roots of the fingers and ends of the palm, outermost, in the grasp frame: metres."""
-    finger, _, palm = hand.parts
-    outer = hand.max_width / 2 + 0.012
-    outermost = ((outer, finger.front), (outer, finger.back), (palm.thickness.full / 2 - 0.002, palm.front - 0.01))
-    return torch.tensor([(0.0, 0.0, 0.0)] + [(0.0, side * y, z) for y, z in outermost for side in (-1, 1)])
-
-
-def _probes(hand: Gripper) -> Tensor:
-    """(S, 3) places on and around the open hand, in the grasp frame, where it matters what the camera did not see."""
-    finger, _, palm = hand.parts
-    tip, half = finger.front, hand.max_width / 2
-    x = finger.breadth.full / 2 - 0.0015
-    fingers = [
-        (x * side_x, side * (half + across), z)
-        for side_x in (-1, 1)
-        for side in (-1, 1)
-        for z in (tip, tip - 0.0116, tip - 0.0226, tip - 0.0346, finger.back)
-        for across in (0.001, 0.012, 0.024)
-    ]
-    between = [
-        (x, y, z) for x in (-0.008, 0.008) for y in (-0.03, -0.015, 0.0, 0.015, 0.03) for z in (tip, -0.01, -0.025)
-    ]
-    ahead = [(0.0, y, tip + 0.012) for y in (-0.05, -0.025, 0.0, 0.025, 0.05)]
-    behind = [(x, y, palm.front - 0.01) for x in (-0.02, 0.02) for y in (-0.09, -0.045, 0.0, 0.045, 0.09)]
-    return torch.tensor(fingers + between + ahead + behind)
-
-
-def _probe_inputs(probes: Tensor, cloud: PreparedCloud, poses: Tensor, sign: Tensor) -> Tensor:
-    """(C, 2 S): how far the probes (S, 3) lie behind what the camera saw, on a coarse and on a fine scale."""
-    places = (mirror_factors(sign)[:, None] * probes) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
+def _probe_inputs(cloud: PreparedCloud, candidates: Candidates, sign: Tensor) -> Tensor:
+    """(C, 2 PROBES): how far the hand's probes lie behind what the camera saw, on a coarse and on a fine scale."""
+    poses = candidates.Ts_canonical_grasp
+    local = probes(candidates.gripper).of(candidates)
+    places = (mirror_factors(sign)[:, None] * local) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
     behind = depth_behind(cloud, places) / _LENGTH
     return torch.cat([behind.clamp(-2, 3), (4 * behind).clamp(-1, 1)], dim=1)

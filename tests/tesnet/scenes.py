@@ -175,6 +175,15 @@ def fresh_network(seed: int = 0) -> TesNet:
         return TesNet(TesNetConfig()).eval()
 
 
+def told_network(seed: int = 0) -> TesNet:
+    """`fresh_network` that is told the hand and the noise, and heeds them."""
+    with torch.random.fork_rng():
+        torch.manual_seed(seed)
+        network = TesNet(TesNetConfig(told=True)).eval()
+        torch.nn.init.normal_(network.told.layer.weight, std=0.3)
+    return network
+
+
 def fresh_predictor(seed: int = 0, calibration: tuple[float, float] = (1.0, 0.0)) -> GraspPredictor:
     """A predictor with `fresh_network(seed)`."""
     network = fresh_network(seed)

@@ -10,8 +10,30 @@ import torch
 
 from tesnet import candidates, cloud
 from tesnet.candidates import Candidates
-from tesnet.networks.tesnet import CloudFeatures, _candidate_inputs, _probe_inputs, edge_features, point_inputs
-from tests.tesnet.scenes import CAMERA, ask, fresh_network, prepared, tabletop, tabletop_query
+from tesnet.geometry import Pose
+from tesnet.hands import HANDS
+from tesnet.networks import encode
+from tesnet.networks.tesnet import (
+    CloudFeatures,
+    TesNet,
+    TesNetConfig,
+    _candidate_inputs,
+    _probe_inputs,
+    edge_features,
+    point_inputs,
+)
+from tesnet.networks.told import TOLD_INPUTS
+from tesnet.points import points_in_grasp_frames
+from tests.tesnet.scenes import (
+    CAMERA,
+    ask,
+    fresh_network,
+    moved_cloud,
+    prepared,
+    tabletop,
+    tabletop_query,
+    told_network,
+)
 
 
 @functools.cache
@@ -63,9 +85,10 @@ def test_a_region_holds_the_points_that_a_loop_finds_there() -> None:
     ready, found = example()
     network = fresh_network()
     for region, points in ((network.closing, ready.points), (network.around, features().patches.points)):
-        index, totals = region.members(points, found.Ts_canonical_grasp)
+        members = region.members(points, found)
+        index, totals = members.index, members.total
         assert index.shape == (len(found), region.count)
-        breadth, length, behind, ahead = region.box
+        breadth, length, behind, ahead = region.region
         for row in range(0, len(found), 12):
             T = found.Ts_canonical_grasp[row].double().numpy()
             local = (points.double().numpy() - T[:3, 3]) @ T[:3, :3]
@@ -88,8 +111,10 @@ def test_a_region_pools_what_its_layers_make_of_points_in_the_grasp_frame() -> N
     region, encoded = fresh_network().closing, features().points
     sign = torch.where(torch.arange(len(found)) % 2 == 0, 1.0, -1.0)
     with torch.inference_mode():
-        pooled, totals = region(encoded, ready, found.Ts_canonical_grasp, sign)
-        index, _ = region.members(ready.points, found.Ts_canonical_grasp)
+        members = region.members(ready.points, found)
+        index, totals = members.index, members.total
+        shift = torch.linspace(-1, 1, len(found))[:, None].expand(-1, region.features.out_features)
+        pooled = region(encoded, ready, members, found.Ts_canonical_grasp, sign, shift)
         for row in range(0, len(found), 15):
             chosen = index[row, : min(region.count, int(totals[row]))]
             T = found.Ts_canonical_grasp[row]
@@ -98,6 +123,7 @@ def test_a_region_pools_what_its_layers_make_of_points_in_the_grasp_frame() -> N
             normal = ready.normals[chosen] @ T[:3, :3] * mirror
             facing = (ready.normals * ready.view_directions).sum(dim=1, keepdim=True)[chosen]
             hidden = region.geometry(torch.cat([position, normal, facing], 1)) + region.features(encoded[chosen])
+            hidden = hidden + shift[row]
             expected = torch.relu(region.update(torch.relu(hidden))).amax(dim=0)
             torch.testing.assert_close(pooled[row], expected, atol=1e-4, rtol=1e-4)
 
@@ -107,8 +133,10 @@ def test_an_empty_region_pools_to_nothing() -> None:
     away = found.Ts_canonical_grasp.clone()
     away[:, :3, 3] += 10
     with torch.inference_mode():
-        pooled, totals = fresh_network().closing(features().points, ready, away, torch.ones(len(found)))
-    assert not totals.any()
+        closing = fresh_network().closing
+        members = closing.members(ready.points, replace(found, Ts_canonical_grasp=away))
+        pooled = closing(features().points, ready, members, away, torch.ones(len(found)))
+    assert not members.total.any()
     assert not pooled.any()
 
 
@@ -143,7 +171,6 @@ def test_the_mirror_option_changes_scores_and_one_leaves_them() -> None:
 def test_a_mirrored_candidate_sees_what_it_would_see_of_the_reflected_scene() -> None:
     """The twin reflects cloud, normals, lines of sight, viewpoint, up and table in each hand's own plane."""
     ready, found = example()
-    network = fresh_network()
     few = found.select(torch.arange(0, len(found), 5))
     totals, one = torch.zeros(len(few), 2), torch.ones(len(few))
     pairs, hidden = [], []
@@ -151,13 +178,13 @@ def test_a_mirrored_candidate_sees_what_it_would_see_of_the_reflected_scene() ->
         single = few.select(torch.tensor([row]))
         pose = single.Ts_canonical_grasp
         twin = reflected(ready, pose[0, :3, 3], pose[0, :3, 0])
-        pairs.append(_candidate_inputs(network.ends, twin, single, totals[:1], one[:1]))
-        hidden.append(_probe_inputs(network.probes, twin, pose, one[:1]))
-    seen = [_candidate_inputs(network.ends, ready, few, totals, sign * one) for sign in (-1, 1)]
+        pairs.append(_candidate_inputs(twin, single, totals[:1], one[:1]))
+        hidden.append(_probe_inputs(twin, single, one[:1]))
+    seen = [_candidate_inputs(ready, few, totals, sign * one) for sign in (-1, 1)]
     torch.testing.assert_close(seen[0], torch.cat(pairs), atol=1e-4, rtol=0)
     assert ((seen[0] - seen[1]).abs() > 1e-3).any(dim=1).all()
     # The pixels of what was seen lie otherwise in the reflected scene.
-    mirrored, plain = (_probe_inputs(network.probes, ready, few.Ts_canonical_grasp, sign * one) for sign in (-1, 1))
+    mirrored, plain = (_probe_inputs(ready, few, sign * one) for sign in (-1, 1))
     assert (mirrored - torch.cat(hidden)).abs().mean() < 0.3 * (plain - torch.cat(hidden)).abs().mean()
 
 
@@ -174,6 +201,71 @@ def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
 
     torch.testing.assert_close(with_side(1.0), score(found), atol=1e-5, rtol=0)
     assert (with_side(0.01) - score(found))[0].abs() > 1e-4
+
+
+@torch.inference_mode()
+def told_score(network: TesNet, found: Candidates, ready: cloud.PreparedCloud | None = None) -> torch.Tensor:
+    ready = ready or example()[0]
+    return network.score(features(), ready, found)
+
+
+def opened_by_degrees(name: str) -> Candidates:
+    """The example's candidates for a known hand, each open by another width."""
+    _, found = example()
+    hand = HANDS[name].gripper
+    return replace(found, gripper=hand, widths=torch.linspace(0.4, 1.0, len(found)) * hand.max_width)
+
+
+@pytest.mark.parametrize("name", ["franka", "rg2"])
+def test_a_network_that_is_told_scores_at_first_as_one_that_is_not(name: str) -> None:
+    with torch.random.fork_rng():
+        torch.manual_seed(0)
+        network = TesNet(TesNetConfig(told=True)).eval()
+    found = opened_by_degrees(name)
+    assert torch.equal(told_score(network, found), told_score(fresh_network(), found))
+
+
+@pytest.mark.parametrize("number", range(TOLD_INPUTS))
+def test_each_number_that_is_told_moves_scores_once_it_has_a_weight(number: int) -> None:
+    network = told_network()
+    network.told.layer.weight.data[:, [other for other in range(TOLD_INPUTS) if other != number]] = 0
+    found = opened_by_degrees("rg2")
+    change = (told_score(network, found) - told_score(fresh_network(), found)).abs()
+    assert float((change > 1e-6).float().mean()) > 0.5
+
+
+def test_a_hand_and_its_opening_change_what_is_looked_at() -> None:
+    _, found = example()
+    narrower = replace(found, widths=found.widths * 0.5)
+    other = replace(found, gripper=HANDS["robotiq_2f140"].gripper)
+    assert (score(narrower) - score(found)).abs().median() > 1e-4
+    assert (score(other) - score(found)).abs().median() > 1e-4
+
+
+def test_a_region_of_a_narrower_opening_holds_what_lies_nearer_the_middle() -> None:
+    ready, found = example()
+    region = fresh_network().closing
+    half = replace(found, widths=found.widths / 2)
+    _, y, _ = points_in_grasp_frames(ready.points, found.Ts_canonical_grasp)
+    members = region.members(ready.points, half)
+    there = (members.total > 0).nonzero()[:, 0]
+    assert len(there) > len(found) // 2
+    assert float(y[there[:, None], members.index[there]].abs().max()) <= 0.025 + 1e-6
+    assert (members.total <= region.members(ready.points, found).total).all()
+
+
+def test_told_scores_do_not_change_with_a_rigid_motion_or_in_smaller_batches() -> None:
+    ready, _ = example()
+    network, found = told_network(), opened_by_degrees("rg2")
+    motion = Pose.random(np.random.default_rng(4), reach=0.3)
+    poses = torch.tensor(motion.matrix @ found.Ts_canonical_grasp.double().numpy()).float()
+    before = told_score(network, found)
+    moved = moved_cloud(ready, motion)
+    with torch.inference_mode():
+        after = network.score(encode(network, moved), moved, replace(found, Ts_canonical_grasp=poses))
+    assert ((after - before).abs() > 1e-3).float().mean() < 0.1
+    few = torch.arange(0, len(found), 7)
+    torch.testing.assert_close(told_score(network, found.select(few)), before[few], atol=1e-4, rtol=0)
 
 
 def test_point_pair_features_are_distances_and_cosines() -> None:
