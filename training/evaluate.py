@@ -15,9 +15,13 @@ from tesnet.networks import Network
 from training import metrics
 from training.views import LabelledView, LabelsError, load_views
 
+WIDTH_BIN_MM = 20
+
 
 def evaluate(name: str, path: Path | None, data: Sequence[Path], seed: int = 0) -> dict[str, Any]:
     """Measures of the weights at `path` (those shipped for the network `name` unless given), overall and by scene.
+
+    Also, by hand, sensor and opening (`by_group`), whether scores are what they say.
 
     They are of candidates that the observed cloud leaves free, which the service ranks; under `with_blocked`, of all
     candidates, as published tests have them. For the latter the labels must be drawn from all candidates alike.
@@ -40,9 +44,39 @@ def evaluate(name: str, path: Path | None, data: Sequence[Path], seed: int = 0) 
         }
 
     result: dict[str, Any] = {"weights_sha256": weights.sha256(path), **measures(blocked=False)}
+    result |= by_group(network, views, header.calibration)
     if not all(bool(view.collision_free.all()) for view in views):
         result["with_blocked"] = measures(blocked=True)
     return result
+
+
+def by_group(
+    network: Network, views: Sequence[LabelledView], calibration: tuple[float, float]
+) -> dict[str, dict[str, Any]]:
+    """`metrics.served` of the free candidates of each group: `by_hand`, `by_sensor` and `by_width`.
+
+    Hands without a name are `other`; a sensor without one is the camera's own, `camera`. Openings are in bins of
+    `WIDTH_BIN_MM`, named by their limits in millimetres.
+    """
+    shown = [view for view in views if view.collision_free.any()]
+    logits, success = _joined(score_views(network, shown))
+    counts = [int(view.collision_free.sum()) for view in shown]
+    found = [view.candidates for view in shown]
+    widths_mm = np.concatenate([(1000 * c.widths[v.collision_free]).numpy() for c, v in zip(found, shown, strict=True)])
+    # Half a micrometre of rounding, so that a hand's own opening is within its bin.
+    low = WIDTH_BIN_MM * np.ceil((widths_mm - 5e-4) / WIDTH_BIN_MM - 1).astype(int)
+    labels = {
+        "by_hand": np.repeat([one.gripper.name or "other" for one in found], counts),
+        "by_sensor": np.repeat([view.sensor or "camera" for view in shown], counts),
+        "by_width": np.array([f"{mm}-{mm + WIDTH_BIN_MM} mm" for mm in low]),
+    }
+    return {
+        name: {
+            str(group): metrics.served(logits[of == group], success[of == group], calibration)
+            for group in np.unique(of)
+        }
+        for name, of in labels.items()
+    }
 
 
 def validate(

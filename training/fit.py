@@ -5,8 +5,8 @@ from __future__ import annotations
 import json
 import math
 import time
-from collections.abc import Sequence
-from dataclasses import asdict, dataclass
+from collections.abc import Mapping, Sequence
+from dataclasses import asdict, dataclass, field
 from pathlib import Path
 from typing import Any, Literal
 
@@ -22,7 +22,7 @@ from tesnet.networks import Network
 from tesnet.predictor import configuration_of
 from tesnet.whole_file import write_whole
 from training import metrics
-from training.augment import augment
+from training.augment import augment, vary
 from training.evaluate import validate
 from training.views import LabelledView, LabelsError, load_views, scene_files
 
@@ -44,6 +44,8 @@ class Recipe:
         blocked_per_view: at most so many more that collide with the observed cloud; the service never scores such, but
             their labels, too, tell what a hand hits.
         keep: weights of the epoch with the least validation loss, or of the last one.
+        vary: whether views are also varied in what the caller may have left out (`training.augment.vary`).
+        network: fields of the network's configuration that differ from those of `start` or else from the defaults.
     """
 
     optimiser: Literal["adam", "adamw"] = "adamw"
@@ -57,12 +59,20 @@ class Recipe:
     candidates_per_view: int = 120
     blocked_per_view: int = 60
     keep: Literal["best", "last"] = "best"
+    vary: bool = False
+    network: Mapping[str, Any] = field(default_factory=dict)
 
 
 PRESETS = {
     "default": Recipe(),
     # For weights that are good already (`start`), on many more views than they saw.
     "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=3),
+    # The one network that is served, from the weights before it (`start`): told the hand and the noise, on folders of
+    # many hands, objects and sensors. Few epochs, because a second look at a view teaches little.
+    "product": Recipe(
+        learning_rate=1e-3, weight_decay=0.02, max_epochs=4, candidates_per_view=160, blocked_per_view=40,
+        vary=True, network={"told": True},
+    ),
     # The same for every network of a comparison. The last epoch is kept: choosing the best one would favour those whose
     # validation loss jumps about.
     "comparison": Recipe(learning_rate=1e-3, max_epochs=8, views_per_step=2, blocked_per_view=80, keep="last"),
@@ -150,7 +160,7 @@ def fit(
     """
     torch.set_num_threads(threads)
     torch.manual_seed(seed)
-    network = networks.build(name)
+    network = _first_network(name, recipe, start)
     if networks.is_weightless(name):
         raise LabelsError(f"{name} has no parameters to train; choose another network")
     train_views = [view for view in load_views(data, network.preparation) if metrics.usable(view.success.numpy())]
@@ -165,10 +175,8 @@ def fit(
     prior = sum(int(view.success.sum()) for view in train_views) / labels
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
-    if start is not None:
-        _begin_with(start, name, network)
     progress = _resume(checkpoint, network, optimiser) or _Progress(asdict(recipe), seed, recipe.learning_rate)
-    if (progress.recipe, progress.seed) != (asdict(recipe), seed):
+    if (Recipe(**progress.recipe), progress.seed) != (recipe, seed):
         raise LabelsError(f"{checkpoint} is of another recipe or seed; use the same ones, or another --out")
     approach_points = APPROACH_POINTS_PER_STEP.get(name)
     last_epoch = min(recipe.max_epochs, epochs or recipe.max_epochs)
@@ -196,17 +204,31 @@ def fit(
     return dict(header.training or {})
 
 
-def _begin_with(start: Path, name: str, network: Network) -> None:
-    """Loads weights; where a layer has got inputs since they were made, which stand last, theirs begin at zero."""
+def _first_network(name: str, recipe: Recipe, start: Path | None) -> Network:
+    """The network to train: with random weights, or with those of a file and its configuration.
+
+    Layers that it has got since that file was made, if a fresh one's are zero, and inputs of layers, which stand last,
+    begin at zero.
+    """
+    if start is None:
+        return networks.build(name, recipe.network)
     state, header = weights.load(start)
-    shapes = {key: tensor.shape for key, tensor in network.state_dict().items()}
+    other = LabelsError(f"{start} holds a {header.network} of another configuration; begin without --start")
+    if header.network != name:
+        raise other
+    try:
+        network = networks.build(name, {**header.configuration["network"], **recipe.network})
+    except (KeyError, TypeError, ValueError) as error:
+        raise other from error
+    fresh = network.state_dict()
+    state = {key: tensor for key, tensor in fresh.items() if not tensor.any()} | state
     for key, tensor in state.items():
-        if key in shapes and tensor.dim() == len(shapes[key]) == 2:
-            state[key] = functional.pad(tensor, (0, max(0, shapes[key][1] - tensor.shape[1])))
-    same = header.configuration.get("network") == json.loads(json.dumps(asdict(network.config)))
-    if header.network != name or not same or {key: tensor.shape for key, tensor in state.items()} != shapes:
-        raise LabelsError(f"{start} holds a {header.network} of another configuration; begin without --start")
+        if key in fresh and tensor.dim() == fresh[key].dim() == 2:
+            state[key] = functional.pad(tensor, (0, max(0, fresh[key].shape[1] - tensor.shape[1])))
+    if {key: tensor.shape for key, tensor in state.items()} != {key: tensor.shape for key, tensor in fresh.items()}:
+        raise other
     network.load_state_dict(state)
+    return network
 
 
 def _optimiser(network: Network, recipe: Recipe) -> torch.optim.Optimizer:
@@ -245,7 +267,8 @@ def _epoch(
         optimiser.zero_grad()
         for index in order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step]:
             rng = np.random.default_rng([progress.seed, progress.epoch, int(index)])
-            loss = _view_loss(network, augment(views[index], rng), log_odds, recipe, rng, approach_points)
+            view = vary(views[index], rng) if recipe.vary else views[index]
+            loss = _view_loss(network, augment(view, rng), log_odds, recipe, rng, approach_points)
             (loss / recipe.views_per_step).backward()
             progress.loss += float(loss.detach())
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)

@@ -76,6 +76,28 @@ def calibration_error(probabilities: Logits, success: Success) -> float:
     return float(np.abs(gap).sum() / len(success))
 
 
+def served(logits: Logits, success: Success, calibration: tuple[float, float]) -> dict[str, float | None]:
+    """How well candidates are judged by their served score, sigmoid(a * logit + b); without an AUROC for one class.
+
+    Args:
+        logits: of the candidates.
+        success: their outcomes.
+        calibration: (a, b).
+    """
+    a, b = calibration
+    scores = a * logits + b
+    both = bool(success.any()) and not bool(success.all())
+    probabilities = 1 / (1 + np.exp(-scores))
+    return {
+        "candidates": len(logits),
+        "successes": int(success.sum()),
+        "mean_score": float(probabilities.mean()),
+        "calibration_error": calibration_error(probabilities, success),
+        "served_loss": cross_entropy(scores, success),
+        "auroc": auroc(logits, success) if both else None,
+    }
+
+
 def fit_calibration(logits: Logits, success: Success) -> tuple[float, float]:
     """(a, b) that minimise the cross-entropy of sigmoid(a * logit + b) (Platt scaling), by damped Newton steps."""
     design = np.stack([logits, np.ones_like(logits)], axis=1)

@@ -44,6 +44,7 @@ class LabelledView:
         collision_free: (C,) whether the observed cloud left the hand's way free: such candidates the service scores.
         scene: kind of the scene, `packed` or `pile`.
         gripper: name of the hand that tried them.
+        sensor: name of the model of the camera's errors; None for the camera's own.
     """
 
     cloud: PreparedCloud
@@ -55,6 +56,7 @@ class LabelledView:
     collision_free: torch.Tensor
     scene: str
     gripper: str = "franka"
+    sensor: str | None = None
 
     @property
     def candidates(self) -> Candidates:
@@ -106,6 +108,7 @@ def save_scene(
             "T_cloud_canonical": cloud.T_cloud_canonical.matrix.tolist(),
             "scene": view.scene,
             "gripper": view.gripper,
+            "sensor": view.sensor,
         }
         arrays |= {
             f"{number}/frame": np.frombuffer(json.dumps(frame).encode(), dtype=np.uint8),
@@ -191,6 +194,7 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
         collision_free=tensor("collision_free", torch.bool),
         scene=frame["scene"],
         gripper=gripper,
+        sensor=frame.get("sensor"),
     )
 
 

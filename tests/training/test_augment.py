@@ -1,13 +1,16 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import torch
 
 from tesnet.networks import encode
-from tesnet.visibility import outside
+from tesnet.visibility import hidden, outside
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view
-from training.augment import augment
+from training import augment as augmenting
+from training.augment import augment, vary
 from training.views import LabelledView
 
 VIEW = labelled_view()
@@ -72,6 +75,80 @@ def test_up_support_and_sides_are_withheld_now_and_then() -> None:
     assert 0 < without_up < without_support < 30
     assert 0 < without_up < without_sides < 30
     assert all(cloud.support_height is None and len(cloud.sides) == 0 for cloud in views if cloud.up is None)
+
+
+def cut_off(seed: int) -> LabelledView:
+    return augmenting._cut_off(VIEW, np.random.default_rng(seed))
+
+
+def test_a_new_side_leaves_what_lies_within_it_and_the_candidates_of_that() -> None:
+    shares = []
+    for seed in range(12):
+        view = cut_off(seed)
+        cloud, found = view.cloud, view.candidates
+        side = cloud.sides[-1]
+        assert len(cloud.sides) == len(VIEW.cloud.sides) + 1
+        assert abs(float(side[:3] @ cloud.up)) < 1e-5  # type: ignore[arg-type]  # it is known
+        assert (cloud.points @ side[:3] <= side[3]).all()
+        dropped = (VIEW.cloud.points @ side[:3] > side[3]).sum()
+        assert len(cloud) + int(dropped) == len(VIEW.cloud)
+        shares.append(int(dropped) / len(VIEW.cloud))
+        exact = torch.cdist(cloud.points, cloud.points, compute_mode="donot_use_mm_for_euclid_dist")
+        found_distances = exact.gather(1, cloud.neighbours)
+        torch.testing.assert_close(found_distances, exact.topk(16, largest=False).values, atol=1e-6, rtol=0)
+        before = {tuple(pose.flatten().tolist()): row for row, pose in enumerate(VIEW.candidates.Ts_canonical_grasp)}
+        rows = [before[tuple(pose.flatten().tolist())] for pose in found.Ts_canonical_grasp]
+        assert torch.equal(view.outcomes, VIEW.outcomes[rows])
+        assert torch.equal(cloud.points[view.approach], VIEW.cloud.points[VIEW.approach[rows]])
+        assert torch.equal(cloud.points[view.contact], VIEW.cloud.points[VIEW.contact[rows]])
+    assert 0.2 < max(shares) <= 0.351
+
+
+def test_a_view_of_which_no_candidate_would_stay_is_left_whole() -> None:
+    alone = augmenting._only(VIEW, torch.tensor([0]))
+    for seed in range(12):
+        view = augmenting._cut_off(alone, np.random.default_rng(seed))
+        assert len(view.outcomes) == 1
+        if len(view.cloud) == len(VIEW.cloud):
+            assert view is alone
+
+
+def test_the_table_is_seen_about_the_things_and_not_behind_them() -> None:
+    before = VIEW.cloud
+    after = augmenting._with_table(before, np.random.default_rng(0))
+    assert before.up is not None
+    assert before.support_height is not None
+    assert after.support_height is None
+    table = after.points[len(before) :]
+    assert len(table) > 500
+    assert torch.equal(after.points[: len(before)], before.points)
+    assert float((table @ before.up - before.support_height).std()) < 0.002
+    assert hidden(before, table).float().mean() < 0.02  # noise moves a place over the edge of a shadow
+    on_grid = (after.points[after.neighbours[len(before) :]] - table[:, None]).norm(dim=2)
+    assert float(on_grid[:, 1].median()) < 0.006
+    torch.testing.assert_close(on_grid[:, 0], torch.zeros(len(table)))
+    towards = torch.nn.functional.normalize(before.viewpoints[0] - table, dim=1)
+    torch.testing.assert_close(after.view_directions[len(before) :], towards, atol=1e-5, rtol=0)
+    assert ((after.normals[len(before) :] * towards).sum(dim=1) > 0).all()
+
+
+def test_views_are_varied_now_and_then_and_keep_what_they_tell_of_their_candidates() -> None:
+    views = [vary(VIEW, np.random.default_rng(seed)) for seed in range(60)]
+    cut = sum(len(view.cloud.sides) > len(VIEW.cloud.sides) for view in views)
+    with_table = sum(view.cloud.support_height is None for view in views)
+    assert 0 < cut < 25
+    assert 0 < with_table < 20
+    assert sum(view is VIEW for view in views) > 25
+    for view in views:
+        assert torch.isfinite(logits(augment(view, np.random.default_rng(0)))).all()
+
+
+def test_a_view_without_up_or_table_is_left_as_it_is() -> None:
+    bare = replace(VIEW, cloud=replace(VIEW.cloud, up=None, support_height=None, sides=VIEW.cloud.sides[:0]))
+    for seed in range(30):
+        varied = vary(bare, np.random.default_rng(seed))
+        assert varied.cloud is bare.cloud
+        assert torch.equal(varied.outcomes, bare.outcomes)
 
 
 def test_augmentation_repeats_for_a_seed_and_leaves_the_view_alone() -> None:

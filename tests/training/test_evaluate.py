@@ -13,7 +13,7 @@ from tesnet.predictor import configuration_of
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view, write
 from training import metrics
-from training.evaluate import evaluate, measure, score_views, validate
+from training.evaluate import by_group, evaluate, measure, score_views, validate
 from training.views import LabelsError, load_views
 
 
@@ -94,10 +94,36 @@ def test_measures_come_overall_by_scene_and_with_what_the_cloud_blocks(tmp_path:
         tmp_path / "a.safetensors", network.state_dict(), weights.Header("tesnet", "1", configuration_of(network))
     )
     found = evaluate("tesnet", tmp_path / "a.safetensors", [write(tmp_path / "labels", [packed, pile])])
-    assert set(found) == {"weights_sha256", "all", "packed", "pile", "with_blocked"}
+    groups = {"by_hand", "by_sensor", "by_width"}
+    assert set(found) == {"weights_sha256", "all", "packed", "pile", "with_blocked", *groups}
+    assert all(sum(row["candidates"] for row in found[group].values()) == 105 for group in groups)
     assert found["weights_sha256"] == weights.sha256(tmp_path / "a.safetensors")
     assert [found[group]["candidates"] for group in ("all", "packed", "pile")] == [105, 45, 60]
     assert [found["with_blocked"][group]["candidates"] for group in ("all", "packed", "pile")] == [120, 60, 60]
+
+
+def test_served_scores_are_judged_by_hand_sensor_and_opening() -> None:
+    free = torch.arange(60) < 50
+    views = [
+        replace(labelled_view(0), collision_free=free),
+        replace(labelled_view(1), gripper="rg2", sensor="d435"),
+        replace(labelled_view(2), sensor="d435", collision_free=torch.zeros(60, dtype=torch.bool)),
+    ]
+    network, calibration = fresh_network(), (2.0, -0.3)
+    found = by_group(network, views, calibration)
+    first, second = score_views(network, views)
+    assert found["by_hand"] == {
+        "franka": metrics.served(*first, calibration),
+        "rg2": metrics.served(*second, calibration),
+    }
+    assert found["by_sensor"] == {
+        "camera": metrics.served(*first, calibration),
+        "d435": metrics.served(*second, calibration),
+    }
+    assert found["by_width"] == {
+        "60-80 mm": metrics.served(*first, calibration),
+        "100-120 mm": metrics.served(*second, calibration),
+    }
 
 
 def test_views_without_ten_successes_are_refused() -> None:

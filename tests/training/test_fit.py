@@ -9,12 +9,13 @@ from typing import Any
 
 import numpy as np
 import pytest
+import safetensors.torch
 import torch
 
 from tesnet import networks, weights
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
-from tesnet.predictor import GraspPredictor
+from tesnet.predictor import GraspPredictor, configuration_of
 from tests.tesnet.scenes import tabletop_query
 from tests.training.synthetic import labelled_view, write
 from training import evaluate as evaluating
@@ -70,7 +71,7 @@ def test_a_stopped_run_goes_on_from_its_checkpoint(folder: Path, tmp_path: Path)
     measured = evaluate("tesnet", tmp_path / "whole.safetensors", [folder / "validation"])
     assert measured["all"]["candidates"] == 60
     assert measured["all"]["balanced_loss"] == pytest.approx(header.training["validation"]["balanced_loss"], abs=1e-4)
-    assert set(measured) == {"weights_sha256", "all", "packed"}
+    assert set(measured) == {"weights_sha256", "all", "packed", "by_hand", "by_sensor", "by_width"}
 
 
 def test_a_run_that_is_stopped_within_an_epoch_ends_as_if_it_had_not_been(
@@ -330,14 +331,46 @@ def test_weights_with_fewer_inputs_are_begun_with_and_others_refused(folder: Pat
     state, header = weights.load(tmp_path / "now.safetensors")
     older = {**state, "candidate.weight": state["candidate.weight"][:, :-3]}
     weights.save(tmp_path / "older.safetensors", older, header)
-    network = networks.build("tesnet")
-    fitting._begin_with(tmp_path / "older.safetensors", "tesnet", network)
-    begun = network.state_dict()["candidate.weight"]
+    begun = fitting._first_network("tesnet", RECIPE, tmp_path / "older.safetensors").state_dict()["candidate.weight"]
     assert torch.equal(begun[:, :-3], state["candidate.weight"][:, :-3])
     assert not begun[:, -3:].any()
     weights.save(tmp_path / "narrow.safetensors", {**state, "lift.weight": state["lift.weight"][:-1]}, header)
-    with pytest.raises(LabelsError, match="of another configuration; begin without --start"):
-        fitting._begin_with(tmp_path / "narrow.safetensors", "tesnet", network)
+    for key in ("lift.weight", "stage.attention_norm.weight"):  # a layer too narrow, one that is missing
+        weights.save(tmp_path / "less.safetensors", {name: state[name] for name in state if name != key}, header)
+    for file, name in (("narrow", "tesnet"), ("less", "tesnet"), ("now", "gpd")):
+        with pytest.raises(LabelsError, match="of another configuration; begin without --start"):
+            fitting._first_network(name, RECIPE, tmp_path / f"{file}.safetensors")
+
+
+def test_a_network_that_was_not_told_goes_on_as_one_that_is_and_stays_so(tmp_path: Path) -> None:
+    recipe = replace(RECIPE, network={"told": True})
+    told = fitting._first_network("tesnet", recipe, weights.default_weights())
+    shipped, header = weights.load(weights.default_weights())
+    assert "told" not in header.configuration["network"]
+    assert not told.state_dict()["told.layer.weight"].any()
+    torch.testing.assert_close({key: told.state_dict()[key] for key in shipped}, shipped, atol=0, rtol=0)
+    weights.save(
+        tmp_path / "told.safetensors", told.state_dict(), weights.Header("tesnet", "1", configuration_of(told))
+    )
+    again = fitting._first_network("tesnet", RECIPE, tmp_path / "told.safetensors")
+    assert again.config == told.config
+    assert again.config.told
+    assert not fitting._first_network("tesnet", RECIPE, None).config.told
+    assert fitting._first_network("tesnet", recipe, None).config.told
+
+
+def test_a_checkpoint_from_before_a_field_of_the_recipe_goes_on(folder: Path, tmp_path: Path) -> None:
+    run(folder, tmp_path / "a.safetensors", epochs=1)
+    path = tmp_path / "a.checkpoint"
+    with safetensors.safe_open(path, "pt") as stored:
+        progress = json.loads(stored.metadata()["progress"])
+        tensors = {key: stored.get_tensor(key) for key in stored.keys()}  # noqa: SIM118  not a mapping
+    for added in ("vary", "network"):
+        del progress["recipe"][added]
+    path.write_bytes(safetensors.torch.save(tensors, {"progress": json.dumps(progress)}))
+    run(folder, tmp_path / "a.safetensors", epochs=2)
+    log = (tmp_path / "a.log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["epoch"] for line in log] == [1, 2]
 
 
 def test_training_learns_the_training_views(folder: Path, tmp_path: Path) -> None:

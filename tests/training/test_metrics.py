@@ -125,3 +125,17 @@ def test_the_edge_metric_averages_over_views_and_repeats_for_a_seed() -> None:
     uneven = [(rng.normal(size=50), rng.random(50) < 0.3) for _ in range(3)]
     assert metrics.edge_metric(uneven, 1) == metrics.edge_metric(uneven, 1)
     assert metrics.edge_metric(uneven, 1) != metrics.edge_metric(uneven, 2)
+
+
+@given(view=scored())
+@FEW
+def test_served_measures_are_those_of_the_calibrated_scores(view: tuple[Logits, Success]) -> None:
+    logits, success = view
+    found = metrics.served(logits, success, (1.7, -0.4))
+    probabilities = 1 / (1 + np.exp(-(1.7 * logits - 0.4)))
+    assert found["mean_score"] == pytest.approx(probabilities.mean())
+    assert found["calibration_error"] == pytest.approx(metrics.calibration_error(probabilities, success))
+    assert found["served_loss"] == pytest.approx(-np.log(np.where(success, probabilities, 1 - probabilities)).mean())
+    assert found["auroc"] == pytest.approx(metrics.auroc(logits, success))
+    assert (found["candidates"], found["successes"]) == (len(logits), success.sum())
+    assert metrics.served(logits[success], success[success], (1.0, 0.0))["auroc"] is None

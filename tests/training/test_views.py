@@ -17,7 +17,7 @@ from training.views import LabelsError, load_scene, load_views, pairs_of, save_s
 
 def test_labels_round_trip(tmp_path: Path) -> None:
     first = replace(labelled_view(0), collision_free=torch.arange(60) % 3 > 0)
-    second = labelled_view(1, count=40)
+    second = replace(labelled_view(1, count=40), sensor="d435")
     path = tmp_path / "scene_0000000.npz"
     save_scene(path, {"seed": 3, "objects": ["a", "b"]}, [first, second])
     description, views = load_scene(path)
@@ -31,6 +31,7 @@ def test_labels_round_trip(tmp_path: Path) -> None:
         assert torch.equal(before.candidates.contact, after.candidates.contact)
         assert torch.equal(before.cloud.neighbours, after.cloud.neighbours)
         assert after.scene == "packed"
+        assert after.sensor == before.sensor
         # float16 coordinates: 0.06 mm at 0.1 m, 0.12 mm beyond 0.125 m; half of that by rounding.
         torch.testing.assert_close(after.cloud.points, before.cloud.points, atol=7e-5, rtol=0)
         tried, stored = before.candidates.Ts_canonical_grasp, after.candidates.Ts_canonical_grasp
