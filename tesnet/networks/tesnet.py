@@ -219,7 +219,8 @@ class RegionPooling(nn.Module):
     Args:
         in_channels: F, features of a point.
         channels: widths of the MLP.
-        count: at most so many points are looked at; where more lie there, a fixed pseudo-random choice of them.
+        count: at most so many points are looked at; where more lie there, a pseudo-random choice of them that is fixed
+            by the number of all points.
         region: where, about the open Franka hand.
     """
 

@@ -8,12 +8,14 @@ from dataclasses import replace
 import numpy as np
 import pytest
 import torch
-from hypothesis import given, settings
+from hypothesis import example, given, settings
 from hypothesis import strategies as st
 
 from tesnet import candidates, weights
 from tesnet.geometry import Pose
 from tesnet.networks import Network, encode
+from tesnet.networks.tesnet import TesNetConfig
+from tesnet.patches import group
 from tesnet.predictor import GraspPredictor
 from tests.tesnet.scenes import (
     CAMERA,
@@ -32,6 +34,9 @@ from tests.tesnet.scenes import (
 # may become unseen: that moves the logits of a few candidates more than rounding does.
 LOGIT_TOLERANCE = 1e-3
 SHARE_AT_AN_EDGE = 0.02
+PATCH = TesNetConfig().patch_size
+LEAST_AGREEMENT = 0.97
+"""Correlation of the logits, where other patches are looked at."""
 POSE_TOLERANCE = 3e-5
 """Of a rotation's entries and of metres; the axis of a grasp of 3 mm depth is the least exact number."""
 
@@ -47,6 +52,7 @@ def network(which: str) -> Network:
 
 @pytest.mark.parametrize("which", ["untrained", "shipped"])
 @given(seed=st.integers(0, 2**31), scene=st.integers(0, 2), with_up=st.booleans())
+@example(seed=727174, scene=2, with_up=True)  # a point crosses the border of a patch
 @settings(max_examples=5, deadline=None)
 def test_for_a_prepared_cloud_scores_are_invariant_and_grasps_equivariant(
     which: str, seed: int, scene: int, with_up: bool
@@ -73,8 +79,13 @@ def test_for_a_prepared_cloud_scores_are_invariant_and_grasps_equivariant(
         scorer = network(which)
         before = scorer.score(encode(scorer, still), still, found.select(first))
         after = scorer.score(encode(scorer, moved), moved, again.select(second))
-    change = (before - after).abs()
-    assert (change > LOGIT_TOLERANCE).float().mean() < SHARE_AT_AN_EDGE
+    if len(group(still, PATCH)) == len(group(moved, PATCH)):
+        change = (before - after).abs()
+        assert (change > LOGIT_TOLERANCE).float().mean() < SHARE_AT_AN_EDGE
+    else:
+        # A point that rounding takes over the border of a patch may make one more or one fewer. Which of many patches a
+        # candidate looks at is a pseudo-random choice among all there are, and another one then: all scores move a bit.
+        assert np.corrcoef(before, after)[0, 1] > LEAST_AGREEMENT
 
 
 def test_end_to_end_the_top_score_hardly_moves_with_the_scene() -> None:
