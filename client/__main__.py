@@ -156,6 +156,7 @@ _PLAIN_OPTIONS = (
     "num_approach_points",
     "max_candidates",
     "unseen",
+    "width",
     "calibrate",
     "pregrasp_distance",
     "frame_convention",
@@ -289,6 +290,11 @@ def _parser() -> argparse.ArgumentParser:
         metavar="NAME",
         help=f"another hand than the Franka's ({', '.join(HANDS)}), sizes (max_width=0.06 finger_depth=0.04 ...), or a "
         "hand and what differs",
+    )
+    add(
+        "--width",
+        choices=("fitted", "full"),
+        help="how far the hand opens: by what was seen between its fingers, or fully",
     )
     add("--unseen", choices=("free", "occupied"), help="the shadow behind observed points, for collisions")
     add(

@@ -210,6 +210,11 @@ class GraspOptions(RequestPart):
         '{"max_width": metres, "finger_depth": metres, ...}, with a "name" those of that hand but for the sizes given. '
         f"It opens at most {WIDEST:g}. Default: franka.",
     )
+    width: Literal["fitted", "full"] = Field(
+        default="full",
+        description="How far the hand opens before it approaches: by what was seen between its fingers and a margin, "
+        "or all it can. Fitted, it clears neighbours that it would hit wide open, but not what nobody saw.",
+    )
     unseen: Literal["free", "occupied"] = Field(
         default="free",
         description="What the collision check takes the shadow behind observed points for: free or occupied.",

@@ -8,8 +8,9 @@ canonical frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator
+from collections.abc import Iterator, Mapping
 from dataclasses import dataclass, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -17,6 +18,7 @@ from numpy.typing import NDArray
 from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
+from tesnet.fitting import fitted
 from tesnet.geometry import PANDA, Gripper
 from tesnet.outline import Outline, outline
 from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
@@ -38,6 +40,8 @@ _LEAST_REACH = 0.005
 
 _ROUNDING = 1e-5
 
+_WIDTH_STEP = 0.01
+
 _NEARLY_FARTHEST = 0.7
 """Of the distance of the farthest point from those chosen: from here on a point is chosen in the same round."""
 
@@ -58,6 +62,7 @@ class CandidateConfig:
         levelled_within_deg: where up is known, a contact normal that deviates less than this from the horizontal is
             taken to be horizontal. Most walls that fingers close on are upright, the noise of a normal tilts the hand,
             and beside a flat object the lower finger of a tilted hand meets the table.
+        centred: whether the hand stands midway between the walls that it closes on, not over the approach point.
     """
 
     max_pair_distance: float = 0.038
@@ -68,6 +73,12 @@ class CandidateConfig:
     max_upward: float = 0.1
     support_clearance: float = 0.004
     levelled_within_deg: float = 25.0
+    centred: bool = True
+
+    @classmethod
+    def stored(cls, limits: Mapping[str, Any]) -> CandidateConfig:
+        """That of a weights file's header; those written before a rule was there do without it."""
+        return cls(**{"centred": False, **limits})
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -142,7 +153,7 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
     if len(survivors) > query.max_candidates:
         chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values
         survivors = survivors[chosen.to(survivors.device)]
-    return candidates.select(survivors), rejected
+    return _fitted(cloud, query, config, candidates.select(survivors)), rejected
 
 
 def more_approach_points(count: int) -> int:
@@ -183,6 +194,17 @@ def _search(
     return candidates, *_judge(cloud, query, config, candidates)
 
 
+def _fitted(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates) -> Candidates:
+    """The candidates as wide as asked and midway between their walls, but for those that would come too low there."""
+    moved = fitted(cloud, candidates, query.gripper, centred=config.centred, policy=query.width)
+    low = _too_low(cloud, moved, query.gripper, config)
+    return replace(
+        moved,
+        Ts_canonical_grasp=torch.where(low[:, None, None], candidates.Ts_canonical_grasp, moved.Ts_canonical_grasp),
+        widths=torch.where(low, candidates.widths, moved.widths),
+    )
+
+
 def _judge(
     cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates
 ) -> tuple[Tensor, dict[str, int]]:
@@ -191,7 +213,7 @@ def _judge(
     masks = {
         "from_below": _comes_from_behind(cloud, candidates, config),
         "approach": _outside_cone(cloud, poses[:, :3, 2], query),
-        "support": hand_clearance(cloud, poses, query.gripper) < config.support_clearance,
+        "support": _too_low(cloud, candidates, query.gripper, config),
         "target": _off_target(cloud, candidates.contact),
     }
     rejected = {}
@@ -265,11 +287,12 @@ def _along_travel(
     approach, edge = (torch.cat(parts) for parts in zip(*found, strict=True))
     contact, closing, travel = edges.points[edge], edges.outward[edge], edges.travel[edge]
     poses = poses_along(cloud.points[approach], cloud.points[contact], closing, travel, hand=hand)
-    too_low = config.support_clearance + _ROUNDING - hand_clearance(cloud, poses, hand)
+    opened = wide_open(poses, hand)
+    too_low = config.support_clearance + _ROUNDING - hand_clearance(cloud, poses, hand, opened)
     reach = ((poses[:, :3, 3] - cloud.points[approach]) * travel).sum(dim=1) + hand.tip_offset
     lift = torch.where(reach - too_low >= _LEAST_REACH, too_low.clamp(min=0), 0.0)
     poses[:, :3, 3] -= lift[:, None] * travel
-    return Candidates(approach, contact, poses, wide_open(poses, hand), hand)
+    return Candidates(approach, contact, poses, opened, hand)
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
@@ -369,15 +392,25 @@ def grasp_poses(
 
 
 def poses_along(
-    approach_points: Tensor, contact_points: Tensor, closing: Tensor, travel: Tensor, *, hand: Gripper = PANDA
+    approach_points: Tensor,
+    contact_points: Tensor,
+    closing: Tensor,
+    travel: Tensor,
+    *,
+    hand: Gripper = PANDA,
+    widths: Tensor | None = None,
 ) -> Tensor:
     """TCP poses (C, 4, 4) of pairs of points (C, 3) whose unit directions of closing and travel (C, 3) are known.
 
-    Those of `grasp_poses` where the directions are; depth is measured along the travel.
+    Those of `grasp_poses` where the directions are; depth is measured along the travel. The hand is open by `widths`
+    (C,), or as wide as it opens.
     """
     d = contact_points - approach_points
     along, depth = ((d * direction).sum(dim=1, keepdim=True) for direction in (closing, travel))
-    return _poses(approach_points, travel, closing, depth, along, hand)
+    poses = _poses(approach_points, travel, closing, depth, along, hand)
+    if widths is not None and hand.linkage_length is not None:
+        poses[:, :3, 3] += (hand.tcp_at(widths) - hand.hand_to_tcp)[:, None] * travel
+    return poses
 
 
 def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor, along: Tensor, hand: Gripper) -> Tensor:
@@ -397,16 +430,35 @@ def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor, along: 
     return poses
 
 
-def hand_clearance(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Tensor:
-    """(C,) metres from the support plane to the lowest corner of the hand, open or closing; infinite without one."""
+def hand_clearance(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, widths: Tensor) -> Tensor:
+    """(C,) metres from the support plane to the lowest corner of the hand, open or closing; infinite without one.
+
+    Hands whose widths (C,) differ by less than `_WIDTH_STEP` are taken to be as wide as the widest of them may be.
+    """
+    clearance = torch.full((len(Ts_canonical_grasp),), math.inf, device=Ts_canonical_grasp.device)
     if cloud.up is None or cloud.support_height is None:
-        return torch.full((len(Ts_canonical_grasp),), math.inf, device=Ts_canonical_grasp.device)
-    corners = torch.tensor(
-        gripper.closing_corners(gripper.max_width), dtype=Ts_canonical_grasp.dtype, device=Ts_canonical_grasp.device
-    )
-    up_in_grasp = (Ts_canonical_grasp[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
-    tcp_height = Ts_canonical_grasp[:, :3, 3] @ cloud.up - cloud.support_height
+        return clearance
+    steps = (widths / _WIDTH_STEP - _ROUNDING).ceil()
+    for step in steps.unique().tolist():
+        alike = steps == step
+        width = min(step * _WIDTH_STEP, gripper.max_width)
+        clearance[alike] = _clearance(cloud, Ts_canonical_grasp[alike], gripper.closing_corners(width))
+    return clearance
+
+
+def _clearance(cloud: PreparedCloud, poses: Tensor, places: NDArray[np.float64]) -> Tensor:
+    """(C,) metres from the support plane to the lowest of the places (K, 3) in the frame of each pose (C, 4, 4)."""
+    assert cloud.up is not None
+    assert cloud.support_height is not None
+    corners = torch.tensor(places, dtype=poses.dtype, device=poses.device)
+    up_in_grasp = (poses[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
+    tcp_height = poses[:, :3, 3] @ cloud.up - cloud.support_height
     return tcp_height + (up_in_grasp @ corners.T).min(dim=1).values
+
+
+def _too_low(cloud: PreparedCloud, candidates: Candidates, hand: Gripper, config: CandidateConfig) -> Tensor:
+    clearance = hand_clearance(cloud, candidates.Ts_canonical_grasp, hand, candidates.widths)
+    return clearance < config.support_clearance
 
 
 def _comes_from_behind(cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig) -> Tensor:

@@ -81,7 +81,7 @@ class GraspPredictor:
         self._network = network
         self._calibration = calibration
         self._preparation = cloud.PreparationConfig(**configuration["preparation"])
-        self._candidates = candidates.CandidateConfig(**configuration["candidates"])
+        self._candidates = candidates.CandidateConfig.stored(configuration["candidates"])
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu", num_threads: int | None = None) -> GraspPredictor:

@@ -62,7 +62,7 @@ class LabelledView:
     def candidates(self) -> Candidates:
         """The candidates with the poses that were tried."""
         hand = HANDS[self.gripper].gripper
-        poses = poses_along(*self.pairs.unbind(dim=1), hand=hand)
+        poses = poses_along(*self.pairs.unbind(dim=1), hand=hand, widths=self.widths)
         return Candidates(self.approach, self.contact, poses, self.widths, hand)
 
     @property
@@ -130,11 +130,14 @@ def save_scene(
 def pairs_of(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> torch.Tensor:
     """(C, 4, 3) approach points, contact points and directions of closing and travel of a hand's candidates on a cloud.
 
-    Where the hand stops short of its usual depth past the contact point, this stands as much less deep.
+    Where the hand stands beside its approach point along the closing direction, this is moved as far; where it stops
+    short of its usual depth past the contact point, this stands as much less deep.
     """
     _, closing, travel = candidates.Ts_canonical_grasp[:, :3, :3].unbind(dim=2)
     approach, contact = cloud.points[candidates.approach], cloud.points[candidates.contact]
-    usual = poses_along(approach, contact, closing, travel, hand=hand)
+    beside = (candidates.Ts_canonical_grasp[:, :3, 3] - approach) * closing
+    approach = approach + beside.sum(dim=1, keepdim=True) * closing
+    usual = poses_along(approach, contact, closing, travel, hand=hand, widths=candidates.widths)
     short = ((usual - candidates.Ts_canonical_grasp)[:, :3, 3] * travel).sum(dim=1, keepdim=True)
     contact = torch.where(short > _ROUNDING, contact - short * travel, contact)
     return torch.stack([approach, contact, closing, travel], dim=1)

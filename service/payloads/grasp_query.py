@@ -51,6 +51,7 @@ def build_query(payload: Payload, options: GraspOptions, max_points: int | None 
         max_candidates=options.max_candidates,
         gripper=gripper_of(options.gripper),
         unseen=options.unseen,
+        width=options.width,
         calibrate=options.calibrate,
         seed=options.seed,
         model=options.model,

@@ -121,7 +121,8 @@ def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict
         "--top-k 7 --viewpoint 0.3 0 -0.6 --viewpoint 0 0 1 --up 0 0 1 --support-height -0.05 "
         "--target-box 0 0 0 1 1 1 --gripper max_width=0.06 finger_depth=0.04 "
         "--workspace -1 -1 -1 1 1 1 --approach 0 0 -1 30 --min-score 0.5 --min-separation 0.02 20 "
-        "--num-approach-points 16 --max-candidates 100 --unseen occupied --calibrate --pregrasp-distance 0.1 "
+        "--num-approach-points 16 --max-candidates 100 --unseen occupied --width fitted --calibrate "
+        "--pregrasp-distance 0.1 "
         "--frame-convention graspnet --seed 4 --model tesnet --request-id r-9"
     )
     assert main([cloud, "--url", server.url, *flags.split()]) == 0
@@ -142,6 +143,7 @@ def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict
         num_approach_points=16,
         max_candidates=100,
         unseen="occupied",
+        width="fitted",
         calibrate=True,
         pregrasp_distance=0.1,
         frame_convention="graspnet",

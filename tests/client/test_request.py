@@ -31,6 +31,7 @@ EVERY_OPTION: dict[str, Any] = {
     "max_candidates": 500,
     "gripper": {"max_width": 0.06, "finger_depth": np.float32(0.04)},
     "unseen": "occupied",
+    "width": "fitted",
     "calibrate": True,
     "pregrasp_distance": 0.1,
     "frame_convention": "graspnet",

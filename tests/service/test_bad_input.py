@@ -183,6 +183,7 @@ INVALID_OPTIONS: dict[str, tuple[str, Any, str]] = {
     "min_separation below zero": ("min_separation", {"translation": -1}, "translation"),
     "too many approach points": ("num_approach_points", 1025, "1024"),
     "too many candidates": ("max_candidates", 20001, "20000"),
+    "width neither fitted nor full": ("width", "wide", "fitted"),
     "unseen neither free nor occupied": ("unseen", "maybe", "occupied"),
     "calibrate neither true nor false": ("calibrate", "often", "boolean"),
     "pregrasp_distance of two metres": ("pregrasp_distance", 2, "1"),

@@ -32,6 +32,7 @@ OPTIONS: dict[str, Any] = {
     "max_candidates": 400,
     "gripper": {"max_width": 0.075},
     "unseen": "free",
+    "width": "full",
     "calibrate": True,
     "pregrasp_distance": 0.08,
     "frame_convention": "panda",

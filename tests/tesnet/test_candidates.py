@@ -126,7 +126,9 @@ def assert_within_limits(cloud_: cloud.PreparedCloud, found: Candidates) -> None
     np.testing.assert_allclose(z, across / depth[:, None], atol=2e-5)  # a depth of 3 mm, points to 2e-8 m
     np.testing.assert_allclose(y, n_c, atol=2e-5)
     np.testing.assert_allclose(x, np.cross(y, z), atol=1e-6)
-    # The fingertips, 8.6 mm beyond the TCP, stop 7 mm past the depth of p_c on the line through p_a.
+    # The fingertips, 8.6 mm beyond the TCP, stop 7 mm past the depth of p_c on the line through p_a, which is moved
+    # along the closing direction until it lies midway between the walls.
+    p_a = p_a + np.einsum("ij,ij->i", tcp - p_a, y)[:, None] * y
     np.testing.assert_allclose(tcp + 0.0086 * z, p_a + (depth[:, None] + 0.007) * z, atol=ROUNDING)
     np.testing.assert_allclose(
         tcp - 0.1034 * z, p_a - (0.105 - depth[:, None]) * z, atol=3e-4
@@ -161,7 +163,7 @@ def lowest_corner(cloud_: cloud.PreparedCloud, found: Candidates) -> Array:
 
 def test_hand_clearance_is_that_of_the_lowest_corner() -> None:
     found, _ = candidates.generate(ready(), tabletop_query(), CandidateConfig(support_clearance=-1.0))
-    clearance = exact(candidates.hand_clearance(ready(), found.Ts_canonical_grasp, PANDA))
+    clearance = exact(candidates.hand_clearance(ready(), found.Ts_canonical_grasp, PANDA, found.widths))
     np.testing.assert_allclose(clearance, lowest_corner(ready(), found), atol=ROUNDING)
     assert clearance.min() < 0 < clearance.max()
 
@@ -170,7 +172,7 @@ def test_without_a_support_nothing_is_too_low() -> None:
     query = ask(tabletop(0), viewpoints=CAMERA, up=UP)
     found, rejected = candidates.generate(prepared(query), query, CONFIG)
     assert rejected["support"] == 0
-    assert torch.isinf(candidates.hand_clearance(prepared(query), found.Ts_canonical_grasp, PANDA)).all()
+    assert torch.isinf(candidates.hand_clearance(prepared(query), found.Ts_canonical_grasp, PANDA, found.widths)).all()
 
 
 def test_without_up_nothing_comes_from_behind_what_is_seen() -> None:

@@ -148,7 +148,9 @@ def test_the_clearance_holds_for_the_lowest_tip_on_the_way(name: str) -> None:
     up = np.array([0.0, 0.6, 0.8])
     cloud = bare_cloud(rng.uniform(-0.1, 0.1, (50, 3)), up=torch.tensor(up).float(), support_height=-0.1)
     Ts = np.array([Pose.random(rng, reach=0.1).matrix for _ in range(40)])
-    found = candidates.hand_clearance(cloud, torch.from_numpy(Ts).float(), hand).numpy()
+    found = candidates.hand_clearance(
+        cloud, torch.from_numpy(Ts).float(), hand, torch.full((len(Ts),), hand.max_width)
+    ).numpy()
     for T, clearance in zip(Ts, found, strict=True):
         lowest = np.inf
         for width in np.linspace(hand.max_width, 0, 200) if name in ARCS else [hand.max_width]:

@@ -112,7 +112,8 @@ def test_no_grasp_breaks_a_limit_of_the_conventions(seed: int) -> None:
     assert (np.linalg.norm(d, axis=1) <= 0.038 + 2e-6).all()
     assert ((depth >= 0.003 - 2e-6) & (depth <= 0.040 + 2e-6)).all()
     assert ((offset >= -0.003 - 2e-6) & (offset <= 0.038 + 2e-6)).all()
-    np.testing.assert_allclose(tcp, p_a + (depth - 0.0016)[:, None] * z, atol=2e-6)
+    middle = p_a + np.einsum("ij,ij->i", tcp - p_a, y)[:, None] * y  # midway between the walls
+    np.testing.assert_allclose(tcp, middle + (depth - 0.0016)[:, None] * z, atol=2e-6)
     assert (z @ UP < 0.1 + 1e-6).all()
     angles = np.degrees(np.arccos(np.clip(z @ cone.direction, -1, 1)))
     assert angles.max() <= 70.0 + 1e-3

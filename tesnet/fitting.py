@@ -1,0 +1,163 @@
+"""How wide the hand opens for each candidate, and where it stands between the walls that its fingers close on.
+
+A pair of points tells the wall of one finger, and of the other only that it lies beyond the approach point. What else
+was seen between the fingers tells more: how far the thing reaches, and how its surface turns away. Knows no network and
+no request. Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass, replace
+from typing import TYPE_CHECKING, Literal
+
+import torch
+from torch import Tensor
+
+from tesnet.cloud import PreparedCloud
+from tesnet.geometry import Gripper
+from tesnet.obstacles import Obstacles
+
+if TYPE_CHECKING:
+    from tesnet.candidates import Candidates
+
+MARGIN = 0.008
+"""Between each finger and the wall that it closes on, where that is seen."""
+
+UNSEEN_MARGIN = 0.014
+"""The same for a wall that is not seen."""
+
+_BESIDE = 0.003
+"""A thing's points lie no farther beside the hand's middle plane than half a finger's breadth and this."""
+
+_BIN = 0.002
+_GAP = 0.016
+"""Between points this far apart a finger fits: what lies beyond is another thing."""
+
+_FACING = 0.85
+"""A wall is seen where the cosine of a normal with the direction that it would face is more."""
+
+_NEAR_END = 0.006
+"""The wall of a finger is sought this near to the end of what is seen."""
+
+_TURNING = 0.12
+"""A surface whose normals at its end lean so far towards the far side goes on; a face that ends level does not."""
+
+_LEAST_SPREAD = 0.02
+"""Of the normals' components along the closing direction, as a variance: less, and they tell of no curve."""
+
+_FEWEST = 6
+
+_FARTHEST_UNSEEN = 0.02
+"""No wall is taken to lie farther beyond what is seen."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Span:
+    """What lies between the fingers of each of C candidates, along the closing direction from the hand's middle.
+
+    Args:
+        near, far: (C,) of the contact point's wall, and of the opposite one: near is more than far.
+        seen: (C,) whether the opposite wall was seen.
+    """
+
+    near: Tensor
+    far: Tensor
+    seen: Tensor
+
+
+def fitted(
+    cloud: PreparedCloud,
+    candidates: Candidates,
+    hand: Gripper,
+    *,
+    centred: bool = True,
+    policy: Literal["fitted", "full"] = "full",
+) -> Candidates:
+    """The candidates, midway between the walls where `centred`, the hand as wide as the policy says.
+
+    `fitted` is what lies between the fingers and a margin beside each, `full` all that the hand opens. A hand whose
+    tips swing forward stands where they come to rest on the walls.
+    """
+    if len(candidates) == 0 or (policy == "full" and not centred):
+        return candidates
+    span = spans(cloud, candidates, hand)
+    middle = (span.near + span.far) / 2
+    shift = middle if centred else torch.zeros_like(middle)
+    extent = (span.near - span.far + 2 * (middle - shift).abs()).clamp(0.0, hand.max_width)
+    widths = candidates.widths
+    if policy == "fitted":
+        margin = torch.where(span.seen, MARGIN, UNSEEN_MARGIN)
+        widths = (extent + 2 * margin).clamp(max=hand.max_width)
+    poses = candidates.Ts_canonical_grasp.clone()
+    poses[:, :3, 3] += shift[:, None] * poses[:, :3, 1]
+    if hand.linkage_length is not None:
+        before, after = (2 * half.clamp(0.0, hand.max_width / 2) for half in (span.near, span.near - shift))
+        rise = hand.tcp_at(widths) - hand.hand_to_tcp - (hand.tcp_at(after) - hand.tcp_at(before))
+        poses[:, :3, 3] += rise[:, None] * poses[:, :3, 2]
+    return replace(candidates, Ts_canonical_grasp=poses, widths=widths)
+
+
+def spans(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> Span:
+    """Where the walls lie that the hand will close on.
+
+    The near one is that of the contact point. From there what was seen between the fingers is followed until a gap in
+    which a finger fits. The far wall is where that ends, unless the surface only begins to turn away there: of a circle
+    y = m + r n holds for the places y and the components n of the normals along the closing direction, with m its
+    middle and r its radius, so the line through them tells where it ends. That counts where it is beyond what was seen.
+    """
+    poses = candidates.Ts_canonical_grasp
+    near = ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
+    row, y, n = _between_fingers(cloud, poses, near, hand)
+    end = _last_before_gap(row, near[row] - y, len(near), hand)
+    own = near[row] - y <= end[row] + _BIN
+    row, y, n = row[own], y[own], n[own]
+    last = near.clone().scatter_reduce(0, row, y, "amin")
+    at_end = y <= last[row] + _NEAR_END
+    lean = torch.zeros_like(near).scatter_reduce(0, row[at_end], n[at_end], "mean", include_self=False)
+    seen = torch.zeros_like(near).scatter_reduce(0, row[at_end], n[at_end], "amin") < -_FACING
+    guess = _by_curvature(row, y, n, len(near))
+    goes_on = ~seen & (lean < -_TURNING) & guess.isfinite()
+    beyond = torch.minimum(last, guess).clamp(min=last - _FARTHEST_UNSEEN)
+    return Span(near, torch.where(goes_on, beyond, last), seen)
+
+
+def _between_fingers(cloud: PreparedCloud, poses: Tensor, near: Tensor, hand: Gripper) -> tuple[Tensor, Tensor, Tensor]:
+    """Candidates (K,), places y (K,) and components of normals along y (K,) of the points between the open fingers."""
+    half = hand.finger_breadth / 2 + _BESIDE
+    low, high = (-half, -hand.max_width, hand.palm_front), (half, hand.max_width, hand.tip_offset)
+    found = []
+    for rows, index, (x, y, z) in Obstacles.of(cloud.points).near(poses, low, high):
+        inside = (x.abs() <= half) & (z >= hand.palm_front) & (z <= hand.tip_offset)
+        inside &= (y <= near[rows] + _BIN) & (y >= near[rows] - hand.max_width)
+        row = rows[inside]
+        found.append((row, y[inside], (cloud.normals[index[inside]] * poses[row, :3, 1]).sum(dim=1)))
+    if not found:
+        nothing = torch.zeros(0, dtype=poses.dtype, device=poses.device)
+        return nothing.long(), nothing, nothing
+    every_row, every_y, every_n = (torch.cat(parts) for parts in zip(*found, strict=True))
+    return every_row, every_y, every_n
+
+
+def _last_before_gap(row: Tensor, depth: Tensor, count: int, hand: Gripper) -> Tensor:
+    """(C,) how far from the near wall the points of each candidate go on without a gap in which a finger fits."""
+    bins = int(hand.max_width / _BIN) + 2
+    gap = int(_GAP / _BIN)
+    occupied = torch.zeros(count, bins + gap, device=depth.device)
+    occupied[row, (depth / _BIN).long().clamp(0, bins - 1)] = 1.0
+    occupied[:, 0] = 1.0
+    ahead = occupied.cumsum(dim=1)
+    empty_ahead = ahead[:, gap:] - ahead[:, :-gap] == 0  # of each bin: none of the next `gap` bins is occupied
+    first = (empty_ahead & (occupied[:, :-gap] > 0)).float().argmax(dim=1)
+    return (first + 1) * _BIN
+
+
+def _by_curvature(row: Tensor, y: Tensor, n: Tensor, count: int) -> Tensor:
+    """(C,) m - r of the line y = m + r n through each candidate's points; NaN where they tell of none."""
+    sums = torch.zeros(count, 5, dtype=y.dtype, device=y.device)
+    sums.index_add_(0, row, torch.stack([torch.ones_like(y), y, n, y * n, n * n], dim=1))
+    points = sums[:, 0].clamp(min=1)
+    mean_y, mean_n, mean_yn, mean_nn = (sums[:, 1:] / points[:, None]).unbind(dim=1)
+    variance = mean_nn - mean_n.square()
+    slope = (mean_yn - mean_y * mean_n) / variance.clamp(min=1e-9)
+    told = (sums[:, 0] >= _FEWEST) & (variance >= _LEAST_SPREAD) & (slope > 0)
+    return torch.where(told, mean_y - slope * mean_n - slope, torch.nan)

@@ -1,0 +1,119 @@
+from __future__ import annotations
+
+import numpy as np
+import pytest
+import torch
+
+from tesnet import candidates, fitting
+from tesnet.candidates import CandidateConfig, Candidates
+from tesnet.cloud import PreparedCloud
+from tesnet.geometry import PANDA, Gripper
+from tesnet.hands import HANDS
+from tests.tesnet.scenes import UP, Array, ask, prepared
+
+ABOVE = np.array([0.05, -0.1, 0.6])
+
+
+def slab(width: float, seed: int = 0, *, far_wall: bool = True) -> tuple[PreparedCloud, Array]:
+    """A bar along x, as wide along y as it says and 4 cm high: its top and the wall at +y, and the other if wanted."""
+    rng = np.random.default_rng(seed)
+    count = 6000
+    top = np.column_stack(
+        [rng.uniform(-0.06, 0.06, count), rng.uniform(-width / 2, width / 2, count), np.full(count, 0.04)]
+    )
+    walls = [
+        np.column_stack(
+            [rng.uniform(-0.06, 0.06, count), np.full(count, side * width / 2), rng.uniform(0.012, 0.04, count)]
+        )
+        for side in ((1.0, -1.0) if far_wall else (1.0,))
+    ]
+    points = np.concatenate([top, *walls])
+    viewpoints = [[0.0, 0.5, 0.5], [0.0, -0.5, 0.5]] if far_wall else [[0.0, 0.5, 0.5]]
+    return prepared(ask(points, viewpoints=viewpoints, up=UP, support_height=0.0)), points
+
+
+def towards_y(cloud: PreparedCloud, hand: Gripper = PANDA, *, centred: bool = True, width: str = "full") -> Candidates:
+    """Candidates that close along y on the bar from above, in the frame of its cloud."""
+    query = ask(np.zeros((1, 3)), up=UP, support_height=0.0, gripper=hand, width=width, num_approach_points=64)
+    found, _ = candidates.generate(cloud, query, CandidateConfig(centred=centred))
+    Ts = cloud.T_cloud_canonical.matrix @ found.Ts_canonical_grasp.double().numpy()
+    return found.select(torch.from_numpy((np.abs(Ts[:, 1, 1]) > 0.99) & (Ts[:, 2, 2] < -0.99)))
+
+
+def places(cloud: PreparedCloud, found: Candidates) -> Array:
+    """(C, 3) TCPs in the frame of the bar."""
+    Ts: Array = cloud.T_cloud_canonical.matrix @ found.Ts_canonical_grasp.double().numpy()
+    return Ts[:, :3, 3]
+
+
+@pytest.mark.parametrize("width", [0.02, 0.045, 0.07])
+@pytest.mark.parametrize("far_wall", [True, False])
+def test_hands_stand_midway_between_walls_seen_or_guessed(width: float, far_wall: bool) -> None:
+    cloud, _ = slab(width, far_wall=far_wall)
+    found = towards_y(cloud)
+    off = places(cloud, found)[:, 1]
+    assert len(found) > 40
+    assert np.abs(np.median(off)) < 0.0015
+    assert np.quantile(np.abs(off), 0.9) < 0.004
+    aside = places(cloud, towards_y(cloud, centred=False))[:, 1]
+    assert np.quantile(np.abs(aside), 0.9) > 0.15 * width  # what the rule is for
+
+
+def test_a_fitted_hand_opens_by_what_it_holds_and_a_margin_and_never_wider_than_it_can() -> None:
+    for width in (0.02, 0.045, 0.075):
+        cloud, _ = slab(width)
+        found = towards_y(cloud, width="fitted")
+        wanted = min(width + 2 * fitting.MARGIN, PANDA.max_width)
+        assert np.abs(np.median(found.widths.numpy()) - wanted) < 0.004
+        assert float(found.widths.max()) <= PANDA.max_width + 1e-9
+        assert (found.openings(PANDA) <= PANDA.max_width).all()
+        assert (towards_y(cloud).widths == torch.tensor(PANDA.max_width)).all()
+
+
+def test_a_thing_beyond_a_gap_is_another_one() -> None:
+    """A second bar, a finger's breadth behind the first, moves no hand; where it touches the first it does."""
+    alone, points = slab(0.03)
+    middle = np.median(places(alone, towards_y(alone))[:, 1])
+    for distance, moved in ((0.024, False), (0.004, True)):
+        other = points[points[:, 2] > 0.035] * [1, 0.3, 1] - [0, 0.015 + distance + 0.005, 0]
+        viewpoints = [[0.0, 0.5, 0.5], [0.0, -0.5, 0.5]]
+        cloud = prepared(ask(np.vstack([points, other]), viewpoints=viewpoints, up=UP, support_height=0.0))
+        found = towards_y(cloud)
+        on_near_wall = exact_y(cloud, found) > 0.01
+        shift = np.median(places(cloud, found)[on_near_wall, 1]) - middle
+        assert (abs(shift) > 0.004) == moved
+
+
+def exact_y(cloud: PreparedCloud, found: Candidates) -> Array:
+    """(C,) where the contact points lie along y."""
+    y: Array = cloud.T_cloud_canonical.apply(cloud.points[found.contact].double().numpy())[:, 1]
+    return y
+
+
+def test_the_far_side_of_a_curve_is_that_of_its_circle() -> None:
+    """A lying cylinder that a camera sees from one side, up to where its surface turns away."""
+    radius = 0.025
+    rng = np.random.default_rng(1)
+    angle = rng.uniform(np.radians(-20), np.radians(120), 8000)
+    points = np.column_stack([rng.uniform(-0.06, 0.06, 8000), radius * np.cos(angle), 0.04 + radius * np.sin(angle)])
+    cloud = prepared(ask(points, viewpoints=[[0.0, 0.6, 0.4]], up=UP, support_height=0.0))
+    found = towards_y(cloud)
+    assert len(found) > 20
+    assert np.abs(np.median(places(cloud, found)[:, 1])) < 0.003
+
+
+@pytest.mark.parametrize("name", ["robotiq_2f85", "rg2"])
+def test_tips_that_swing_come_to_rest_where_those_of_a_parallel_hand_would(name: str) -> None:
+    """However wide the hand arrives: the base link then stands where its tips, closed on the bar, are as deep."""
+    hand = HANDS[name].gripper
+    cloud, _ = slab(0.03)
+    bases = {}
+    for width in ("full", "fitted"):
+        found = towards_y(cloud, hand, width=width)
+        Ts = found.Ts_canonical_grasp.double().numpy()
+        base = Ts[:, :3, 3] - hand.tcp_at(found.widths.double().numpy())[:, None] * Ts[:, :3, 2]
+        bases[width] = dict(zip(zip(found.approach.tolist(), found.contact.tolist(), strict=True), base, strict=True))
+    both = bases["full"].keys() & bases["fitted"].keys()
+    assert len(both) > 10
+    apart = np.array([np.linalg.norm(bases["full"][pair] - bases["fitted"][pair]) for pair in both])
+    assert np.mean(apart < 1e-5) > 0.9  # but where it would come too low midway between the walls
