@@ -8,10 +8,10 @@ import math
 import sys
 from collections.abc import Sequence
 from pathlib import Path
-from typing import get_args
 
 from simharness.errors import SimError
-from simharness.sim.camera import Preset
+from simharness.sim.camera import PRESETS
+from simharness.sim.sensors.catalogue import SENSORS
 from tesnet import networks
 from tesnet.cloud import PreparationConfig
 from tesnet.errors import TesnetError
@@ -19,7 +19,8 @@ from tesnet.hands import HANDS
 from training.archive import is_archive, pack, unpack
 from training.compare import compare
 from training.evaluate import evaluate
-from training.fit import PRESETS, fit
+from training.fit import PRESETS as RECIPES
+from training.fit import fit
 from training.generate import GenerateConfig, generate
 from training.views import LabelsError
 
@@ -96,8 +97,22 @@ def _add_generate(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--mine", type=Path, metavar="WEIGHTS", help="draw half of the others from what these score best"
     )
-    parser.add_argument("--camera", choices=get_args(Preset), default="random")
-    parser.add_argument("--gripper", choices=tuple(HANDS), default="franka", help="the hand that tries the grasps")
+    parser.add_argument(
+        "--model",
+        default="tesnet",
+        choices=networks.NETWORKS,
+        help="prepare the clouds as this network wants them (with --mine: as that one does)",
+    )
+    parser.add_argument(
+        "--camera", choices=(*PRESETS, "any"), default="random", help="'any': one to four views from anywhere"
+    )
+    parser.add_argument("--sensor", choices=(*SENSORS, "random"), help="default: the camera's own")
+    parser.add_argument(
+        "--gripper",
+        choices=(*HANDS, "random"),
+        default="franka",
+        help="the hand that tries the grasps; 'random': a new one each scene",
+    )
     for name, words in (("scale", "scale"), ("mass", "mass in kilograms"), ("friction", "coefficient of friction")):
         parser.add_argument(
             f"--{name}",
@@ -128,7 +143,9 @@ def _generate(options: argparse.Namespace) -> dict[str, object]:
         colliding_share=options.colliding_share,
         mine=options.mine,
         camera=options.camera,
+        sensor=options.sensor,
         gripper=options.gripper,
+        model=options.model,
         scale=_limits(options.scale, "scale"),
         mass=_limits(options.mass, "mass"),
         friction=_limits(options.friction, "friction"),
@@ -201,7 +218,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
         default=(),
         help="folders of labelled scenes that fit the calibration of the served score; default: those of --validation",
     )
-    parser.add_argument("--preset", default="default", choices=sorted(PRESETS))
+    parser.add_argument("--preset", default="default", choices=sorted(RECIPES))
     parser.add_argument("--start", type=Path, metavar="WEIGHTS", help="begin with these instead of random weights")
     parser.add_argument("--epochs", type=_positive, help="stop after so many, whatever the schedule")
     parser.add_argument("--threads", type=_positive, default=2)
@@ -217,7 +234,7 @@ def _fit(options: argparse.Namespace) -> dict[str, object]:
         options.model,
         data,
         options.validation,
-        PRESETS[options.preset],
+        RECIPES[options.preset],
         options.out,
         epochs=options.epochs,
         threads=options.threads,

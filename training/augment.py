@@ -133,5 +133,7 @@ def augment(view: LabelledView, rng: np.random.Generator) -> LabelledView:
         sides=sides if keep_sides else sides[:0],
         T_cloud_canonical=cloud.T_cloud_canonical @ Pose(rotation, rotation @ -centre.double().numpy()).inverse(),
     )
-    shift = torch.stack([centre, centre, torch.zeros(3), torch.zeros(3)])  # two points and two directions
-    return replace(view, cloud=turned, pairs=(view.pairs - shift) @ turn.T)
+    poses = view.poses.clone()
+    poses[:, :3, 3] -= centre
+    poses[:, :3] = turn @ poses[:, :3]
+    return replace(view, cloud=turned, poses=poses)

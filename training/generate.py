@@ -24,22 +24,23 @@ from numpy.typing import NDArray
 from tqdm import tqdm
 
 from simharness.play.crew import Done, Emit, Work, crew
-from simharness.sim.camera import Observation, Preset, observe
 from simharness.sim.execute import label_strict, snapshot_of
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcomes import OUTCOME_KINDS
-from simharness.sim.protocol import query_about
 from simharness.sim.scene import Variety, describe, make_scene, scales_for
 from simharness.sim.world import World
 from tesnet import candidates, cloud, networks
 from tesnet.collision import blocked
-from tesnet.hands import HANDS, KnownHand
 from tesnet.networks import Network
 from tesnet.whole_file import write_whole
-from training.views import LabelledView, LabelsError, count_outcomes, pairs_of, save_scene, scene_files
+from training.hands import drawn_hand
+from training.viewing import Camera, Viewing, draw_viewing
+from training.views import LabelledView, LabelsError, count_outcomes, save_scene, scene_files
 
 _HEAR_S = 1.0
+_HANDS_STREAM = 1_000_000
+"""Beside the numbers of views: what is drawn of hands changes nothing else."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -57,8 +58,10 @@ class GenerateConfig:
             all candidates alike.
         mine: weights of a network; half of the candidates that do not collide are then drawn from the quarter that it
             scores best, where its mistakes become failed attempts.
-        camera: preset.
-        gripper: name of the hand.
+        camera: preset, or `any` (`training.viewing`).
+        sensor: its name, or `random` for a new one each view; None is the camera's own.
+        gripper: name of the hand, or `random` for a new one each scene.
+        model: the network whose preparation the clouds get; that of `mine` where there is one.
         scale: limits of the objects' scale for the Panda; None is the protocol's.
         mass: limits in kilograms; None is the protocol's one.
         friction: limits of the objects' coefficient; None is the protocol's one.
@@ -73,17 +76,14 @@ class GenerateConfig:
     labels_per_view: int = 320
     colliding_share: float | None = 0.7
     mine: Path | None = None
-    camera: Preset = "random"
+    camera: Camera = "random"
+    sensor: str | None = None
     gripper: str = "franka"
+    model: str = "tesnet"
     scale: tuple[float, float] | None = None
     mass: tuple[float, float] | None = None
     friction: tuple[float, float] | None = None
     things: int | None = None
-
-    @property
-    def hand(self) -> KnownHand:
-        """The hand that `gripper` names."""
-        return HANDS[self.gripper]
 
 
 def generate(
@@ -204,15 +204,15 @@ class _Scenes:
         os.nice(10)
         torch.set_num_threads(1)
         sets = object_sets(self.config)
-        network = None if self.config.mine is None else networks.load(self.config.mine)[0]
+        judge = Judge.of(self.config)
 
         def make(number: int, _: Emit) -> _Made:
             started = time.monotonic()
-            description, views = label_scene(self.config, sets, number, network)
+            description, views = label_scene(self.config, sets, number, judge)
             counts = count_outcomes(view.outcomes.numpy() for view in views)
             with TemporaryDirectory(prefix="scene-") as folder:
                 path = Path(folder) / _file_name(number)
-                save_scene(path, description, views)
+                save_scene(path, description, views, judge.preparation)
                 return _Made(path.read_bytes(), counts, time.monotonic() - started)
 
         yield make
@@ -222,37 +222,58 @@ def _file_name(number: int) -> str:
     return f"scene_{number:07d}.npz"
 
 
+@dataclass(frozen=True, eq=False, slots=True)
+class Judge:
+    """What clouds are prepared for, and what may say which candidates are worth trying.
+
+    Args:
+        preparation: of the clouds.
+        network: that mines; None draws at random.
+    """
+
+    preparation: cloud.PreparationConfig
+    network: Network | None = None
+
+    @classmethod
+    def of(cls, config: GenerateConfig) -> Judge:
+        """That of a configuration."""
+        if config.mine is None:
+            return cls(networks.NETWORKS[config.model][0].preparation)
+        network, header = networks.load(config.mine)
+        return cls(cloud.PreparationConfig(**header.configuration["preparation"]), network)
+
+
 def label_scene(
-    config: GenerateConfig, sets: Sequence[tuple[ObjectModel, ...]], number: int, network: Network | None = None
+    config: GenerateConfig, sets: Sequence[tuple[ObjectModel, ...]], number: int, judge: Judge
 ) -> tuple[dict[str, Any], list[LabelledView]]:
     """Makes scene `number`, observes it from `config.views` cameras and tries candidates of each view.
 
-    A view's camera and noise derive from the seed, the scene's number and its own, so that it can be rendered again.
+    Hand, cameras and noise derive from the seed, the scene's number and the view's own; the description tells them, so
+    that a view can be rendered again.
     """
     rng = _rng(config, number)
     models = sets[int(rng.integers(len(sets)))]
+    known = drawn_hand(config.gripper, _rng(config, number, _HANDS_STREAM))
     with World() as world:
-        hand = Hand(world, config.hand)
+        hand = Hand(world, known)
         scene = make_scene(
             world,
             config.scene,
             models,
             rng,
             num_objects=_number_of_things(config, rng),
-            scale_range=scales_for(config.scene, config.hand.gripper, config.scale),
+            scale_range=scales_for(config.scene, known.gripper, config.scale),
             variety=Variety(config.mass, config.friction),
         )
-        description = describe(scene) | {"seed": config.seed, "number": number, "camera": config.camera, "cameras": []}
+        description = describe(scene) | {"seed": config.seed, "number": number, "views": []}
         views: list[LabelledView] = []
-        if not scene.placed:
-            return description, views
-        for number_of_view in range(config.views):
+        for number_of_view in range(config.views if scene.placed else 0):
             rng = _rng(config, number, number_of_view)
-            observation = observe(world, config.camera, rng)
-            description["cameras"].append(observation.Ts_world_camera.tolist())
-            view = _label_view(world, hand, observation, config, rng, network)
+            viewing = draw_viewing(config.camera, config.sensor, rng)
+            view = _label_view(world, hand, viewing, config, rng, judge)
             if view is not None:
                 views.append(view)
+                description["views"].append(viewing.describe())
         return description, views
 
 
@@ -269,18 +290,18 @@ def _rng(config: GenerateConfig, *numbers: int) -> np.random.Generator:
 def _label_view(
     world: World,
     hand: Hand,
-    observation: Observation,
+    viewing: Viewing,
     config: GenerateConfig,
     rng: np.random.Generator,
-    network: Network | None,
+    judge: Judge,
 ) -> LabelledView | None:
-    query = query_about(observation, int(rng.integers(2**31)), hand.gripper)
-    prepared = cloud.prepare(query, cloud.PreparationConfig(), torch.device("cpu"))
+    query = viewing.query(viewing.observe(world), int(rng.integers(2**31)), hand.gripper)
+    prepared = cloud.prepare(query, judge.preparation, torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
     free = ~blocked(prepared, found, query.gripper, query.unseen)
-    chosen = _choose(prepared, found, free, config, rng, network)
+    chosen = _choose(prepared, found, free, config, rng, judge.network)
     if len(chosen) == 0:
         return None
     which = torch.from_numpy(chosen)
@@ -290,14 +311,14 @@ def _label_view(
         kinds = label_strict(world, hand, Ts_world_grasp, picked.openings(hand.gripper), snapshot)
     return LabelledView(
         cloud=prepared,
-        pairs=pairs_of(prepared, picked, hand.gripper),
+        poses=picked.Ts_canonical_grasp,
         widths=picked.widths,
         approach=picked.approach,
         contact=picked.contact,
         outcomes=torch.tensor([OUTCOME_KINDS.index(kind) for kind in kinds], dtype=torch.uint8),
         collision_free=free[which],
         scene=config.scene,
-        gripper=config.gripper,
+        gripper=hand.gripper,
     )
 
 

@@ -16,14 +16,12 @@ from numpy.typing import NDArray
 from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
 from tesnet.cloud import PreparationConfig, PreparedCloud
-from tesnet.geometry import Gripper, Pose
+from tesnet.geometry import PANDA, Gripper, Pose
 from tesnet.hands import HANDS
 from tesnet.orientation import orient
 from tesnet.whole_file import whole_file
 
 _TODAY = PreparationConfig()
-_ROUNDING = 1e-5
-"""Metres."""
 
 
 class LabelsError(Exception):
@@ -36,34 +34,32 @@ class LabelledView:
 
     Args:
         cloud: in its canonical frame.
-        pairs: (C, 4, 3) approach point, contact point, and directions of closing and travel of each candidate.
-        widths: (C,) metres between the fingers as they arrived.
-        approach, contact: (C,) the points of the cloud nearest to those of the pairs: where the cloud was rendered
-            again, no point lies just there.
+        poses: (C, 4, 4) T_canonical_grasp of each candidate, as it was tried.
+        widths: (C,) how far the hand was open then, metres.
+        approach, contact: (C,) indices of the pair: where the cloud was rendered again, of its points nearest to those
+            that the pair had.
         outcomes: (C,) codes into `OUTCOME_KINDS`.
         collision_free: (C,) whether the observed cloud left the hand's way free: such candidates the service scores.
         scene: kind of the scene, `packed` or `pile`.
-        gripper: name of the hand that tried them.
+        gripper: the hand that tried them.
         sensor: name of the model of the camera's errors; None for the camera's own.
     """
 
     cloud: PreparedCloud
-    pairs: torch.Tensor
+    poses: torch.Tensor
     widths: torch.Tensor
     approach: torch.Tensor
     contact: torch.Tensor
     outcomes: torch.Tensor
     collision_free: torch.Tensor
     scene: str
-    gripper: str = "franka"
+    gripper: Gripper = PANDA
     sensor: str | None = None
 
     @property
     def candidates(self) -> Candidates:
-        """The candidates with the poses that were tried."""
-        hand = HANDS[self.gripper].gripper
-        poses = poses_along(*self.pairs.unbind(dim=1), hand=hand, widths=self.widths)
-        return Candidates(self.approach, self.contact, poses, self.widths, hand)
+        """The candidates as they were tried."""
+        return Candidates(self.approach, self.contact, self.poses, self.widths, self.gripper)
 
     @property
     def success(self) -> torch.Tensor:
@@ -107,7 +103,7 @@ def save_scene(
             "sides": cloud.sides.tolist(),
             "T_cloud_canonical": cloud.T_cloud_canonical.matrix.tolist(),
             "scene": view.scene,
-            "gripper": view.gripper,
+            "gripper": gripper_values(view.gripper),
             "sensor": view.sensor,
         }
         arrays |= {
@@ -118,29 +114,13 @@ def save_scene(
             f"{number}/neighbours": cloud.neighbours.numpy().astype(np.uint16),
             f"{number}/approach": view.approach.numpy().astype(np.uint16),
             f"{number}/contact": view.contact.numpy().astype(np.uint16),
-            f"{number}/pairs": view.pairs.numpy(),
+            f"{number}/poses": view.poses[:, :3].numpy(),
             f"{number}/widths": view.widths.numpy(),
             f"{number}/outcomes": view.outcomes.numpy().astype(np.uint8),
             f"{number}/collision_free": view.collision_free.numpy(),
         }
     with whole_file(path) as file:
         np.savez(file, allow_pickle=False, **arrays)
-
-
-def pairs_of(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> torch.Tensor:
-    """(C, 4, 3) approach points, contact points and directions of closing and travel of a hand's candidates on a cloud.
-
-    Where the hand stands beside its approach point along the closing direction, this is moved as far; where it stops
-    short of its usual depth past the contact point, this stands as much less deep.
-    """
-    _, closing, travel = candidates.Ts_canonical_grasp[:, :3, :3].unbind(dim=2)
-    approach, contact = cloud.points[candidates.approach], cloud.points[candidates.contact]
-    beside = (candidates.Ts_canonical_grasp[:, :3, 3] - approach) * closing
-    approach = approach + beside.sum(dim=1, keepdim=True) * closing
-    usual = poses_along(approach, contact, closing, travel, hand=hand, widths=candidates.widths)
-    short = ((usual - candidates.Ts_canonical_grasp)[:, :3, 3] * travel).sum(dim=1, keepdim=True)
-    contact = torch.where(short > _ROUNDING, contact - short * travel, contact)
-    return torch.stack([approach, contact, closing, travel], dim=1)
 
 
 def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
@@ -162,9 +142,7 @@ def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
 
 def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     frame = json.loads(arrays[f"{number}/frame"].tobytes())
-    gripper = frame.get("gripper", "franka")
-    if arrays[f"{number}/pairs"].shape[1:] != (4, 3):
-        raise ValueError("its pairs have no directions of travel")
+    gripper = gripper_of(frame.get("gripper", "franka"))
 
     def tensor(name: str, dtype: torch.dtype) -> torch.Tensor:
         array = arrays[f"{number}/{name}"]
@@ -187,10 +165,15 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
         sides=torch.tensor(frame["sides"]).reshape(-1, 4),
         T_cloud_canonical=Pose.from_matrix(frame["T_cloud_canonical"]),
     )
+    if f"{number}/poses" in arrays:
+        poses, widths = _whole(tensor("poses", torch.float32)), tensor("widths", torch.float32)
+    else:
+        poses = _poses_of_pairs(tensor("pairs", torch.float32), gripper)
+        widths = torch.full((len(poses),), gripper.max_width)
     return LabelledView(
         cloud=cloud,
-        pairs=tensor("pairs", torch.float32),
-        widths=_widths(arrays, number, gripper),
+        poses=poses,
+        widths=widths,
         approach=tensor("approach", torch.long),
         contact=tensor("contact", torch.long),
         outcomes=tensor("outcomes", torch.uint8),
@@ -201,11 +184,32 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
     )
 
 
-def _widths(arrays: Mapping[str, NDArray[Any]], number: int, gripper: str) -> torch.Tensor:
-    """Those of a view; hands were wide open before files told them."""
-    if f"{number}/widths" in arrays:
-        return torch.from_numpy(arrays[f"{number}/widths"])
-    return torch.full((len(arrays[f"{number}/outcomes"]),), HANDS[gripper].gripper.max_width)
+def _whole(rows: torch.Tensor) -> torch.Tensor:
+    """Poses (C, 4, 4) of their upper three rows (C, 3, 4)."""
+    last = torch.tensor([0.0, 0.0, 0.0, 1.0], dtype=rows.dtype).expand(len(rows), 1, 4)
+    return torch.cat([rows, last], dim=1)
+
+
+def _poses_of_pairs(pairs: torch.Tensor, gripper: Gripper) -> torch.Tensor:
+    """Poses of the wide open hand in files of before 0.6.0.
+
+    Args:
+        pairs: (C, 4, 3) approach point, contact point, and directions of closing and travel.
+        gripper: the hand.
+    """
+    if pairs.shape[1:] != (4, 3):
+        raise ValueError("its pairs have no directions of travel")
+    return poses_along(*pairs.unbind(dim=1), hand=gripper)
+
+
+def gripper_values(gripper: Gripper) -> dict[str, Any]:
+    """A hand as plain JSON values."""
+    return {**gripper.sizes(), "name": gripper.name}
+
+
+def gripper_of(values: str | Mapping[str, Any]) -> Gripper:
+    """The hand that `gripper_values` described, or that has a name."""
+    return HANDS[values].gripper if isinstance(values, str) else Gripper(**values)
 
 
 def scene_files(folders: Sequence[Path]) -> list[Path]:

@@ -8,9 +8,8 @@ import torch
 
 from simharness.sim.outcomes import OUTCOME_KINDS
 from tesnet import candidates
-from tesnet.geometry import PANDA
 from tests.tesnet.scenes import WORKSPACE, prepared, tabletop_query
-from training.views import LabelledView, pairs_of, save_scene
+from training.views import LabelledView, save_scene
 
 
 def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) -> LabelledView:
@@ -31,7 +30,7 @@ def labelled_view(seed: int = 0, count: int = 60, positives: int | None = None) 
     outcomes[successes] = OUTCOME_KINDS.index("success")
     return LabelledView(
         cloud=ready,
-        pairs=pairs_of(ready, found, PANDA),
+        poses=found.Ts_canonical_grasp,
         widths=found.widths,
         approach=found.approach,
         contact=found.contact,

@@ -1,0 +1,119 @@
+"""How a scene is looked at: cameras, sensor, what is shown of the table. The same value gives the same cloud again."""
+
+from __future__ import annotations
+
+from collections.abc import Mapping
+from dataclasses import dataclass, replace
+from typing import Any, Literal, cast, get_args
+
+import numpy as np
+
+from simharness.sim.camera import PRESET_SENSOR, Observation, Preset, Stand, observe_from, sample_camera
+from simharness.sim.protocol import query_about
+from simharness.sim.scene import WORKSPACE
+from simharness.sim.sensors.catalogue import D435, SENSORS, SensorName, random_sensor
+from simharness.sim.sensors.sensor import Sensor
+from simharness.sim.sensors.stereo import Stereo
+from simharness.sim.world import World
+from tesnet.geometry import Gripper, Pose
+from tesnet.query import GraspQuery
+
+Camera = Preset | Literal["any"]
+"""A preset, or one to four views from any place that a camera may have."""
+
+RANDOM = "random"
+
+Shows = Literal["box", "table", "open"]
+"""The cloud that is asked about: cropped to the workspace, as the protocol has it; all that is seen, with the workspace
+named; or that without a workspace."""
+SHOWS: tuple[Shows, ...] = get_args(Shows)
+
+_SHARES_OF_SHOWS = (0.5, 0.35, 0.15)
+_SHARES_OF_COUNTS = (0.55, 0.15, 0.15, 0.15)
+_MOST_POLAR_DEG = 80.0
+_DISTANCES = (0.35, 1.2)
+_NEAREST_LONG_FOCUS = 0.5
+_LONG_FOCUS = D435.focal_length * 1.5
+_MIDDLE = (WORKSPACE.minimum + WORKSPACE.maximum) / 2
+_HALF_TURN = Pose(np.diag([-1.0, -1.0, 1.0]), np.array([2 * _MIDDLE[0], 2 * _MIDDLE[1], 0.0]))
+"""About the vertical through the middle of the table, T_world_world: preset `random` stands on one side of it."""
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class Viewing:
+    """How a scene is looked at.
+
+    Args:
+        cameras: T_world_camera of each view; several are fused into one cloud.
+        sensor: name in `SENSORS`, or `random`: then it is drawn from `seed`.
+        seed: of the sensor and its noise.
+        shows: what is asked about.
+    """
+
+    cameras: tuple[Pose, ...]
+    sensor: str
+    seed: int
+    shows: Shows = "box"
+
+    def describe(self) -> dict[str, Any]:
+        """As plain JSON values."""
+        cameras = [camera.matrix.tolist() for camera in self.cameras]
+        return {"cameras": cameras, "sensor": self.sensor, "seed": self.seed, "shows": self.shows}
+
+    @classmethod
+    def described(cls, values: Mapping[str, Any]) -> Viewing:
+        """From what `describe` gave."""
+        cameras = tuple(Pose.from_matrix(matrix) for matrix in values["cameras"])
+        return cls(cameras, values["sensor"], values["seed"], values["shows"])
+
+    def observe(self, world: World) -> Observation:
+        """What is seen of a world."""
+        rng = np.random.default_rng(self.seed)
+        sensor = sensor_of(self.sensor, rng)
+        return observe_from(world, self.cameras, rng, sensor, table_in_view=self.shows != "box")
+
+    def query(self, observation: Observation, seed: int, gripper: Gripper) -> GraspQuery:
+        """What is asked about an observation."""
+        query = query_about(observation, seed, gripper)
+        return replace(query, workspace=None) if self.shows == "open" else query
+
+
+def draw_viewing(camera: Camera, sensor: str | None, rng: np.random.Generator) -> Viewing:
+    """A way to look at a scene.
+
+    `any` has one view in 0.55 of the cases, up to four otherwise, each 0 to 80 degrees from straight above and 0.35 to
+    1.2 m from the middle of the table (sensors of long focus from 0.5 m), and shows the table in a half of them.
+
+    Args:
+        camera: a preset or `any`.
+        sensor: its name, or `random`; None is the preset's own (of `any` that of the protocol).
+        rng: source of all that is random about it.
+    """
+    seed = int(rng.integers(2**32))
+    if camera != "any":
+        name = PRESET_SENSOR[camera] if sensor is None else sensor
+        return Viewing(sample_camera(camera, rng), name, seed)
+    name = PRESET_SENSOR["random"] if sensor is None else sensor
+    drawn = sensor_of(name, np.random.default_rng(seed))
+    count = int(rng.choice(len(_SHARES_OF_COUNTS), p=_SHARES_OF_COUNTS)) + 1
+    shows = SHOWS[int(rng.choice(len(SHOWS), p=_SHARES_OF_SHOWS))]
+    return Viewing(tuple(_anywhere(drawn, rng) for _ in range(count)), name, seed, shows)
+
+
+def sensor_of(name: str, rng: np.random.Generator) -> Sensor:
+    """A sensor by its name; nothing is drawn unless it is `random`."""
+    return random_sensor(rng) if name == RANDOM else SENSORS[cast(SensorName, name)]
+
+
+def viewings_of(description: Mapping[str, Any]) -> list[Viewing]:
+    """How the labelled views of a described scene were taken."""
+    return [Viewing.described(values) for values in description["views"]]
+
+
+def _anywhere(sensor: Sensor, rng: np.random.Generator) -> Pose:
+    """T_world_camera; azimuths are 0 to 360 degrees."""
+    long_focus = any(isinstance(part, Stereo) and part.focal_length > _LONG_FOCUS for part in sensor.depth)
+    nearest = _NEAREST_LONG_FOCUS if long_focus else _DISTANCES[0]
+    polar_deg, distance = rng.uniform(0.0, _MOST_POLAR_DEG), rng.uniform(nearest, _DISTANCES[1])
+    (camera,) = sample_camera("random", rng, Stand(polar_deg=float(polar_deg), distance=float(distance)))
+    return _HALF_TURN @ camera if rng.uniform() < 0.5 else camera
