@@ -1,7 +1,7 @@
 """Labels in a form small enough to ship: scenes, views, poses and outcomes; the clouds are rendered again from it.
 
-An archive is a folder of parts, `labels_*.npz` (`training.parts`), which may be written one after the other while labels
-are made.
+An archive is a folder of parts, `labels_*.npz` (`training.parts`), which may be written one after the other while
+labels are made.
 """
 
 from __future__ import annotations

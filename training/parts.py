@@ -234,7 +234,9 @@ def _compressed(arrays: Mapping[str, NDArray[Any]]) -> bytes:
     content = io.BytesIO()
     with zipfile.ZipFile(content, "w", zipfile.ZIP_LZMA) as file:
         for name, array in arrays.items():
-            with file.open(zipfile.ZipInfo(f"{name}.npy"), "w") as member:
+            info = zipfile.ZipInfo(f"{name}.npy")  # which has no time, so equal labels make equal files
+            info.compress_type = zipfile.ZIP_LZMA
+            with file.open(info, "w") as member:
                 np.lib.format.write_array(member, array, allow_pickle=False)
     return content.getvalue()
 
@@ -300,7 +302,7 @@ class _Part:
         for name in ("mass", "friction"):
             if f"object_{name}" in self.arrays:
                 for item, value in zip(items, self.take(f"object_{name}", count).tolist(), strict=True):
-                    item |= {} if np.isnan(value) else {name: value}
+                    item.update({} if np.isnan(value) else {name: value})
         return items
 
     def cameras(self) -> Array:
