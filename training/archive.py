@@ -248,16 +248,20 @@ def _from_elsewhere(
     world: World, views: Sequence[ArchivedView], viewing: Viewing, preparation: cloud.PreparationConfig
 ) -> LabelledView | None:
     """All labels of a scene whose places are seen from a new camera, where the hand's way is judged anew."""
-    fields = ("places", "Ts_world_grasp", "widths", "outcomes", "collision_free")
-    joined = {name: np.concatenate([getattr(view, name) for view in views]) for name in fields}
-    everything = replace(views[0], viewing=viewing, **joined)
+    everything = ArchivedView(
+        viewing=viewing,
+        gripper=views[0].gripper,
+        places=np.concatenate([view.places for view in views]),
+        Ts_world_grasp=np.concatenate([view.Ts_world_grasp for view in views]),
+        widths=np.concatenate([view.widths for view in views]),
+        outcomes=np.concatenate([view.outcomes for view in views]),
+        collision_free=np.concatenate([view.collision_free for view in views]),
+    )
     shown = _render_view(world, everything, preparation)
     if shown is None:
         return None
-    near = (_shifts(shown, everything.places) < LARGEST_SHIFT).all(dim=1)
-    picked = {name: getattr(shown, name)[near] for name in ("poses", "widths", "approach", "contact", "outcomes")}
-    shown = replace(shown, **picked)
-    return replace(shown, collision_free=~blocked(shown.cloud, shown.candidates, shown.gripper, "free"))
+    seen = shown.only((_shifts(shown, everything.places) < LARGEST_SHIFT).all(dim=1))
+    return replace(seen, collision_free=~blocked(seen.cloud, seen.candidates, seen.gripper, "free"))
 
 
 def _shifts(view: LabelledView, places: NDArray[np.float64]) -> torch.Tensor:

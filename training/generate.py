@@ -143,7 +143,7 @@ def generate(
         "this_run": {
             "labels": fresh,
             "seconds": round(time.monotonic() - started, 1),
-            "labels_per_worker_second": round(fresh / max(busy_s, 1e-9), 1),
+            "labels_per_cpu_second": round(fresh / max(busy_s, 1e-9), 1),
         },
     }
     (out / "account.json").write_text(json.dumps(account, indent=2) + "\n")
@@ -181,7 +181,7 @@ def object_sets(config: GenerateConfig) -> list[tuple[ObjectModel, ...]]:
 
 @dataclass(frozen=True, eq=False, slots=True)
 class _Made:
-    """A labelled scene: its file's content, the counts of its outcomes, and the seconds it took."""
+    """A labelled scene: its file's content, the counts of its outcomes, and the CPU seconds it took."""
 
     content: bytes
     counts: np.ndarray[Any, np.dtype[np.int64]]
@@ -207,13 +207,13 @@ class _Scenes:
         judge = Judge.of(self.config)
 
         def make(number: int, _: Emit) -> _Made:
-            started = time.monotonic()
+            started = time.process_time()
             description, views = label_scene(self.config, sets, number, judge)
             counts = count_outcomes(view.outcomes.numpy() for view in views)
             with TemporaryDirectory(prefix="scene-") as folder:
                 path = Path(folder) / _file_name(number)
                 save_scene(path, description, views, judge.preparation)
-                return _Made(path.read_bytes(), counts, time.monotonic() - started)
+                return _Made(path.read_bytes(), counts, time.process_time() - started)
 
         yield make
 

@@ -195,12 +195,12 @@ class _Frames:
     def origin(self, turn: NDArray[np.int64]) -> Array:
         """Where offsets begin (C, 3): over the approach points as deep as the contact points."""
         z = self.turned(turn)[:, :, 2]
-        return self.approach + (self.d * z).sum(axis=1, keepdims=True) * z
+        return np.asarray(self.approach + (self.d * z).sum(axis=1, keepdims=True) * z)
 
 
 def _frames(approach: NDArray[np.int64], contact: NDArray[np.int64]) -> _Frames:
     """Of approach points (C, 3) and contact points with directions (C, 5) on the grid."""
-    p_a, p_c = approach * LENGTH, contact[:, :3] * LENGTH
+    p_a, p_c = np.asarray(approach * LENGTH), np.asarray(contact[:, :3] * LENGTH)
     azimuth, elevation = (contact[:, 3:] * ANGLE).T
     y = np.stack([np.cos(elevation) * np.cos(azimuth), np.cos(elevation) * np.sin(azimuth), np.sin(elevation)], axis=1)
     d = p_c - p_a
@@ -210,7 +210,7 @@ def _frames(approach: NDArray[np.int64], contact: NDArray[np.int64]) -> _Frames:
     # Where y is upright there is no down across it; any direction does, since the turn makes up for it.
     down = np.where(np.linalg.norm(down, axis=1, keepdims=True) > 0.1, down, np.cross(y, [1.0, 0.0, 0.0]))
     z = np.where(shallow[:, None], down, across)
-    z /= np.linalg.norm(z, axis=1, keepdims=True)
+    z = np.asarray(z / np.linalg.norm(z, axis=1, keepdims=True))
     return _Frames(p_a, d, np.cross(y, z), y, z)
 
 

@@ -5,7 +5,7 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass
+from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
 
@@ -60,6 +60,18 @@ class LabelledView:
     def candidates(self) -> Candidates:
         """The candidates as they were tried."""
         return Candidates(self.approach, self.contact, self.poses, self.widths, self.gripper)
+
+    def only(self, which: torch.Tensor) -> LabelledView:
+        """The view with the candidates at the indices (K,), or where the mask (C,) is true."""
+        return replace(
+            self,
+            poses=self.poses[which],
+            widths=self.widths[which],
+            approach=self.approach[which],
+            contact=self.contact[which],
+            outcomes=self.outcomes[which],
+            collision_free=self.collision_free[which],
+        )
 
     @property
     def success(self) -> torch.Tensor:

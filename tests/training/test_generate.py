@@ -1,7 +1,7 @@
 from __future__ import annotations
 
 import json
-from dataclasses import replace
+from dataclasses import asdict, replace
 from pathlib import Path
 from typing import Any
 
@@ -11,14 +11,17 @@ import torch
 
 from simharness.sim.outcomes import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
-from tesnet import weights
-from tesnet.cloud import prepare
+from simharness.sim.scene import restore_scene
+from simharness.sim.world import World
+from tesnet import networks, weights
+from tesnet.cloud import PreparationConfig, prepare
 from tesnet.hands import HANDS
 from tesnet.predictor import GraspPredictor
 from tesnet.query import GraspQuery
 from training import generate as generating
-from training.archive import pack
+from training import viewing
 from training.generate import GenerateConfig, generate
+from training.viewing import viewings_of
 from training.views import LabelsError, load_scene, scene_files
 
 pytestmark = pytest.mark.sim
@@ -48,7 +51,8 @@ def test_labels_come_with_all_that_is_needed_to_see_the_scene_again(labels: Path
     total = 0
     for path in files:
         description, views = load_scene(path)
-        assert {"seed", "number", "cameras"} <= set(description)
+        assert {"seed", "number", "views"} <= set(description)
+        assert len(description["views"]) == len(views)
         assert len(views) <= 1
         for view in views:
             total += len(view.outcomes)
@@ -83,8 +87,8 @@ def test_labels_show_the_clouds_as_the_service_prepares_them(monkeypatch: pytest
         queries.append(query_about(*arguments))
         return queries[-1]
 
-    monkeypatch.setattr(generating, "query_about", noted)
-    _, (view,) = generating.label_scene(CONFIG, generating.object_sets(CONFIG), 0)
+    monkeypatch.setattr(viewing, "query_about", noted)
+    _, (view,) = generating.label_scene(CONFIG, generating.object_sets(CONFIG), 0, generating.Judge.of(CONFIG))
     served = prepare(queries[0], GraspPredictor.load(weights.default_weights()).preparation, torch.device("cpu"))
     assert served is not None
     for name in ("points", "normals", "spectrum", "neighbours", "view_directions"):
@@ -111,17 +115,54 @@ def test_a_folder_of_other_settings_is_refused(labels: Path) -> None:
 def test_labels_of_another_hand_say_so_and_keep_its_poses(tmp_path: Path) -> None:
     generate(replace(CONFIG, gripper="rg2", scene="pile", labels_per_view=4), 1, 1, tmp_path)
     views = [view for path in scene_files([tmp_path]) for view in load_scene(path)[1]]
-    assert {view.gripper for view in views} == {"rg2"}
-    view = next(view for view in views if len(view.outcomes))
-    hand = HANDS["rg2"].gripper
-    p_a, p_c, closing, travel = view.pairs.double().unbind(dim=1)
-    d = p_c - p_a
-    closed = 2 * (d * closing).sum(dim=1).clamp(0, hand.max_width / 2)
-    tips = (d * travel).sum(dim=1) + 0.007  # past the approach point, once the hand has closed
-    expected = p_a + (tips - hand.tip_offset - hand.tcp_at(closed) + hand.hand_to_tcp)[:, None] * travel
-    np.testing.assert_allclose(view.candidates.Ts_canonical_grasp[:, :3, 3], expected, atol=1e-5)
-    with pytest.raises(LabelsError, match="labels of rg2; an archive keeps those of franka alone"):
-        pack([tmp_path], tmp_path / "archive")
+    assert {view.gripper for view in views} == {HANDS["rg2"].gripper}
+    assert {view.gripper.name for view in views} == {"rg2"}
+    assert all((view.widths <= view.gripper.max_width + 1e-6).all() for view in views)
+
+
+def test_every_scene_may_have_a_new_hand(tmp_path: Path) -> None:
+    random_hands = replace(CONFIG, gripper="random", labels_per_view=2)
+    judge = generating.Judge.of(random_hands)
+    sets = generating.object_sets(random_hands)
+    scenes = [generating.label_scene(random_hands, sets, number, judge)[1] for number in range(4)]
+    hands = {view.gripper.max_width for views in scenes for view in views}
+    assert len(hands) >= 3
+    # What is drawn of hands does not change the cameras.
+    described = [generating.label_scene(config, sets, 0, judge)[0]["views"] for config in (random_hands, CONFIG)]
+    assert described[0][0]["cameras"] == described[1][0]["cameras"]
+
+
+def test_views_through_any_sensor_are_told_so_that_they_can_be_taken_again() -> None:
+    config = replace(CONFIG, camera="any", sensor="random", labels_per_view=2, views=3)
+    sets, judge = generating.object_sets(config), generating.Judge.of(config)
+    description, views = generating.label_scene(config, sets, 1, judge)
+    assert len(description["views"]) == len(views) > 0
+    models = {model.name: model for some in sets for model in some}
+    with World() as world:
+        restore_scene(world, description, models)
+        for look, view in zip(viewings_of(description), views, strict=True):
+            query = look.query(look.observe(world), 0, view.gripper)
+            again = prepare(query, judge.preparation, torch.device("cpu"))
+            assert again is not None
+            assert abs(len(again) - len(view.cloud)) <= 0.02 * len(view.cloud)
+            one, other = (
+                torch.from_numpy(seen.T_cloud_canonical.apply(seen.points.numpy())) for seen in (again, view.cloud)
+            )
+            distance = torch.cdist(one, other).min(dim=1).values
+            assert distance.quantile(0.9) < 1e-3
+
+
+def test_clouds_are_prepared_as_a_network_wants_them(monkeypatch: pytest.MonkeyPatch) -> None:
+    assert generating.Judge.of(replace(CONFIG, model="gpd")).preparation == networks.NETWORKS["gpd"][0].preparation
+    fine = PreparationConfig(voxel_size=0.003)
+    network, header = networks.load(weights.default_weights())
+    header = replace(header, configuration={**header.configuration, "preparation": asdict(fine)})
+    monkeypatch.setattr(networks, "load", lambda _: (network, header))
+    judge = generating.Judge.of(replace(CONFIG, mine=Path("weights")))
+    assert judge.preparation == fine
+    scene = generating.label_scene(CONFIG, generating.object_sets(CONFIG), 0, judge)
+    usual = generating.label_scene(CONFIG, generating.object_sets(CONFIG), 0, generating.Judge.of(CONFIG))
+    assert len(scene[1][0].cloud) > 1.5 * len(usual[1][0].cloud)
 
 
 def test_tables_may_hold_more_things_of_other_weight_and_grip(tmp_path: Path) -> None:
