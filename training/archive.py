@@ -267,9 +267,9 @@ def _from_elsewhere(
 def _shifts(view: LabelledView, places: NDArray[np.float64]) -> torch.Tensor:
     """(C, 2) metres from the places of pairs in the world to the points that stand for them."""
     wanted = torch.tensor(view.cloud.T_cloud_canonical.inverse().apply(places)).float()
-    return (torch.stack([view.cloud.points[view.approach], view.cloud.points[view.contact]], dim=1) - wanted).norm(
-        dim=2
-    )
+    found = torch.stack([view.cloud.points[view.approach], view.cloud.points[view.contact]], dim=1)
+    shifts: torch.Tensor = (found - wanted).norm(dim=2)
+    return shifts
 
 
 def _render_view(world: World, view: ArchivedView, preparation: cloud.PreparationConfig) -> LabelledView | None:

@@ -359,8 +359,8 @@ def _read_old_view(part: _Part) -> ArchivedView:
     # The oldest parts are from before there were pairs that travel straight down.
     if "straight_down" in part.arrays:
         down = part.take("straight_down", num_labels)
-        z = np.tile(_DOWN, (int(down.sum()), 1))
-        some = (torch.from_numpy(rows[down]) for rows in (approach, contact, closing, z))
+        travel = np.tile(_DOWN, (num_labels, 1))
+        some = (torch.from_numpy(rows[down]) for rows in (approach, contact, closing, travel))
         poses[down] = poses_along(*some, hand=gripper).numpy()
     return ArchivedView(
         viewing=viewing,

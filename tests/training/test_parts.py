@@ -30,7 +30,12 @@ def view(seed: int, count: int = 40) -> ArchivedView:
 
 
 def scene(number: int, **more: Any) -> ArchivedScene:
-    item: dict[str, Any] = {"name": "a", "scale": 0.75, "position": [0.1, 0.2, 0.05], "quaternion_xyzw": [0, 0, 0, 1.0]}
+    item: dict[str, Any] = {
+        "name": "a",
+        "scale": 0.75,
+        "position": [0.125, 0.25, 0.0625],
+        "quaternion_xyzw": [0, 0, 0, 1.0],
+    }
     light = {**item, "name": "b", "mass": 0.125, "friction": 0.5}
     description = {"kind": "pile", "seed": 7, "number": number, "objects": [item, light]}
     return ArchivedScene({**description, **more}, tuple(view(3 * number + step) for step in range(number % 3)))
