@@ -1,7 +1,7 @@
 """`python -m simharness`: clear tables through the service and count.
 
 `replay` shows one attempt again, `failures` sorts failed attempts by cause, `robustness` repeats a run under worse
-sensing.
+sensing, `compare` with several networks, `paired` compares two runs scene by scene.
 
 Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker failed in mid-run,
 what was done is kept; 130 and 143 stopped by Ctrl-C and by SIGTERM.
@@ -12,23 +12,27 @@ from __future__ import annotations
 import argparse
 import signal
 import sys
-from collections.abc import Sequence
+from collections.abc import Callable, Iterable, Sequence
 from contextlib import ExitStack
-from dataclasses import replace
+from dataclasses import dataclass, replace
 from pathlib import Path
 from types import FrameType
 from typing import TYPE_CHECKING, Any
 
+import numpy as np
 from tqdm import tqdm
 
 from simharness.errors import RunBroken, SimError
 from simharness.flags_from_settings import (
+    compare_parser,
     failures_parser,
     out_of,
+    paired_parser,
     replay_parser,
     robustness_parser,
     run_parser,
     settings_of,
+    trials_of,
 )
 from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
 from simharness.play.photographer import attempts_to_show, keep_only, take_pictures
@@ -38,7 +42,9 @@ from simharness.play.round import camera_sensor
 from simharness.play.run import Hooks, run
 from simharness.play.settings import RunSettings
 from simharness.report.causes import failures, failures_report, failures_table
+from simharness.report.compare import TABLE, Comparison
 from simharness.report.page import page
+from simharness.report.paired import paired, paired_table
 from simharness.report.progress import Progress
 from simharness.report.report import package_versions, report, table
 from simharness.report.robustness import JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
@@ -78,7 +84,7 @@ def _fail(error: SimError, code: int) -> int:
 
 def _run(options: argparse.Namespace) -> int:
     settings = settings_of(options)
-    folder = RunFolder(out_of(options, settings))
+    folder = RunFolder(out_of(options, f"{settings.scene}-{settings.executor}"))
     _, code = _clear(options, settings, folder)
     if settings.calibrate and options.calibrate is None and not code:
         print(f"\n{PUBLISHED_CROP}: the same rounds without the table in view, as published", flush=True)
@@ -89,23 +95,72 @@ def _run(options: argparse.Namespace) -> int:
 
 def _robustness(options: argparse.Namespace) -> int:
     settings = settings_of(options)
-    folder = RunFolder(out_of(options, settings, "robustness-"))
+    folder = RunFolder(out_of(options, f"robustness-{settings.scene}-{settings.executor}"))
     study = Study(settings, options.against)
-    code = 0
-    for condition in conditions(options.against):
-        print(f"\n{condition.name}", flush=True)
-        result, code = _clear(options, condition.settings(settings), RunFolder(folder.path / condition.name))
-        if code:
-            break
-        study.add(condition, result)
-    folder.write_json(JSON_FILE, study.report(package_versions()))
-    folder.write_text(TABLE_FILE, study.table())
-    folder.write_text(PLOT_FILE, study.plot())
+    of_name = {condition.name: condition for condition in conditions(options.against)}
+
+    def take(name: str, result: Run) -> None:
+        study.add(of_name[name], result)
+        folder.write_json(JSON_FILE, study.report(package_versions()))
+        folder.write_text(TABLE_FILE, study.table())
+        folder.write_text(PLOT_FILE, study.plot())
+
+    parts = [_Part(name, condition.settings(settings)) for name, condition in of_name.items()]
+    code = _clear_each(options, parts, folder, take)
     print(f"\n{study.table()}\nplot      {folder.path / PLOT_FILE}")
     return code
 
 
-def _clear(options: argparse.Namespace, settings: RunSettings, folder: RunFolder) -> tuple[Run, int]:
+def _compare(options: argparse.Namespace) -> int:
+    trials = trials_of(options)
+    folder = RunFolder(out_of(options, "compare"))
+    comparison = Comparison(trials)
+
+    def take(name: str, result: Run) -> None:
+        comparison.add(name, result)
+        folder.write_json(f"{TABLE}.json", comparison.report(package_versions()))
+        folder.write_text(f"{TABLE}.md", comparison.table())
+        chart = comparison.chart()
+        folder.write_text(f"{TABLE}.svg", chart.svg())
+        chart.save_png(folder.path / f"{TABLE}.png")
+
+    parts = [_Part(trial.name, trial.settings, trial.contestant.weights) for trial in trials]
+    code = _clear_each(options, parts, folder, take)
+    print(f"\n{comparison.table()}\nchart     {folder.path / TABLE}.svg, .png")
+    return code
+
+
+@dataclass(frozen=True, slots=True)
+class _Part:
+    """One run of several.
+
+    Args:
+        name: of its folder in the folder of all.
+        settings: of the run.
+        weights: that its service loads; None for what it loads by itself.
+    """
+
+    name: str
+    settings: RunSettings
+    weights: Path | None = None
+
+
+def _clear_each(
+    options: argparse.Namespace, parts: Iterable[_Part], folder: RunFolder, take: Callable[[str, Run], None]
+) -> int:
+    """Carry one run out after the other and hand each to `take` with its name; stops at one that breaks off."""
+    for part in parts:
+        print(f"\n{part.name}", flush=True)
+        result, code = _clear(options, part.settings, RunFolder(folder.path / part.name), part.weights)
+        if code:
+            return code
+        take(part.name, result)
+    return 0
+
+
+def _clear(
+    options: argparse.Namespace, settings: RunSettings, folder: RunFolder, weights: Path | None = None
+) -> tuple[Run, int]:
     """Carry a run out, leave its reports, print its table; the run and the exit code."""
     check_sensing(settings.camera, camera_sensor(settings))
     objects = _objects(settings)
@@ -132,6 +187,7 @@ def _clear(options: argparse.Namespace, settings: RunSettings, folder: RunFolder
             ray=options.ray,
             resume=options.resume,
             hooks=Hooks(progress.start, progress.add, event),
+            weights=weights,
         )
     _leave(result, folder)
     print(table(result))
@@ -174,6 +230,14 @@ def _replay(options: argparse.Namespace) -> int:
     return 0
 
 
+def _paired(options: argparse.Namespace) -> int:
+    runs = [RunFolder(path) for path in (options.first, options.second)]
+    settings = [folder.read_run()[0] for folder in runs]
+    result = paired(runs[0].read_rounds(), runs[1].read_rounds(), np.random.default_rng(0))
+    print(paired_table((str(options.first), str(options.second)), (settings[0], settings[1]), result))
+    return 0
+
+
 def _failures(options: argparse.Namespace) -> int:
     folder = RunFolder(options.folder)
     settings, _, _ = folder.read_run()
@@ -199,6 +263,8 @@ _COMMANDS = (
     ("replay", replay_parser, _replay),
     ("failures", failures_parser, _failures),
     ("robustness", robustness_parser, _robustness),
+    ("compare", compare_parser, _compare),
+    ("paired", paired_parser, _paired),
 )
 
 

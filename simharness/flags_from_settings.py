@@ -8,7 +8,7 @@ from __future__ import annotations
 
 import argparse
 import os
-from collections.abc import Callable
+from collections.abc import Callable, Collection
 from datetime import datetime, timezone
 from pathlib import Path
 from typing import Any, Literal, get_args, get_origin
@@ -16,7 +16,10 @@ from typing import Any, Literal, get_args, get_origin
 from simharness.errors import UsageError
 from simharness.play.folder import FAILURES_FILE
 from simharness.play.settings import Flag, Interval, Part, RunSettings, flags
+from simharness.report.compare import TABLE as TABLE2
+from simharness.report.compare import Contestant, Trial
 from simharness.report.robustness import AXIS_NAMES, JSON_FILE, PLOT_FILE, TABLE_FILE
+from simharness.sim.execute import Executor
 from simharness.sim.objects import SceneKind
 
 DEFAULT_OBJECTS: dict[SceneKind, str] = {"packed": "procedural", "pile": "pybullet-random"}
@@ -54,10 +57,47 @@ def settings_of(options: argparse.Namespace) -> RunSettings:
     return RunSettings(seeds=seeds, max_grasps=MAX_GRASPS_WATCHED if options.watch else 1, **given)
 
 
-def out_of(options: argparse.Namespace, settings: RunSettings, prefix: str = "") -> Path:
-    """Where the reports go: a new folder in runs/, with a name of the time, unless one was given."""
+def out_of(options: argparse.Namespace, name: str) -> Path:
+    """Where the reports go: a new folder in runs/, of a name and the time, unless one was given."""
     now = datetime.now(timezone.utc).strftime("%Y%m%dT%H%M%SZ")
-    return options.out or Path("runs") / f"{prefix}{settings.scene}-{settings.executor}-{now}"
+    return options.out or Path("runs") / f"{name}-{now}"
+
+
+def trials_of(options: argparse.Namespace) -> list[Trial]:
+    """The runs of a comparison: for every scene and executor one with each network.
+
+    Raises:
+        UsageError: flags that do not go together, or one network twice.
+    """
+    contestants = [_contestant(text) for text in ",".join(options.models).split(",") if text]
+    names = [contestant.name for contestant in contestants]
+    if not names or len(set(names)) < len(names):
+        raise UsageError(
+            f"--models {' '.join(options.models)}: give networks of different names; of one with two weights files, "
+            "the names are those of the files"
+        )
+    if options.url is not None and any(contestant.weights for contestant in contestants):
+        raise UsageError("--models NAME=PATH is for services that are started here; leave out --url, or the paths")
+    return [
+        Trial(
+            contestant,
+            settings_of(
+                argparse.Namespace(
+                    **vars(options) | {"scene": scene, "executor": executor, "model": contestant.network}
+                )
+            ),
+        )
+        for scene in dict.fromkeys(options.scenes)
+        for executor in dict.fromkeys(options.executors)
+        for contestant in contestants
+    ]
+
+
+def _contestant(text: str) -> Contestant:
+    network, given, path = text.strip().partition("=")
+    if given and not Path(path).is_file():
+        raise UsageError(f"--models {text}: there is no file {path or 'without a name'}; give NAME or NAME=PATH")
+    return Contestant(network, Path(path).resolve() if given else None)
 
 
 def _absolute(name: str | None) -> str | None:
@@ -74,7 +114,8 @@ def run_parser() -> argparse.ArgumentParser:
         prog="python -m simharness",
         description="Clear simulated tables through the grasp service and report success rates. Other commands: "
         "`replay DIR --attempt K` shows one attempt again, `failures DIR` sorts failed attempts by cause, `robustness` "
-        "repeats a run under worse sensing; each has --help.",
+        "repeats a run under worse sensing, `compare` repeats it with several networks, `paired RUN RUN` compares two "
+        "runs scene by scene; each has --help.",
         epilog=_EXIT_CODES,
         allow_abbrev=False,
     )
@@ -114,6 +155,44 @@ def robustness_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def compare_parser() -> argparse.ArgumentParser:
+    """Of `compare`, which goes over scenes, executors and networks by itself."""
+    parser = argparse.ArgumentParser(
+        prog="python -m simharness compare",
+        description="Play the same rounds with several networks, one after the other, each behind a service of its own "
+        f"unless --url names one that has all of them; leaves a run for each and {TABLE2}.md, .json, .svg and .png, "
+        "brought up to date after each. Differences are paired by scene, against tesnet or else the first network.",
+        epilog=_EXIT_CODES,
+        allow_abbrev=False,
+    )
+    add = parser.add_argument
+    add(
+        "--models",
+        nargs="+",
+        required=True,
+        metavar="NAME[=PATH]",
+        help="networks, with spaces or commas between them; PATH is a weights file, by whose name it is then called",
+    )
+    add("--scenes", nargs="+", choices=get_args(SceneKind), default=get_args(SceneKind), help="default: both")
+    add("--executors", nargs="+", choices=get_args(Executor), default=("edge",), help="default: edge")
+    _add_run_options(parser, without=("scene", "executor", "model"))
+    _add_settings(parser, "camera")
+    parser.set_defaults(watch=False)
+    return parser
+
+
+def paired_parser() -> argparse.ArgumentParser:
+    """Of `paired`."""
+    parser = argparse.ArgumentParser(
+        prog="python -m simharness paired",
+        description="Compare two runs scene by scene: rates over the rounds that both have, and the first's minus the "
+        "second's with an interval from the bootstrap over rounds.",
+    )
+    parser.add_argument("first", type=Path, metavar="RUN", help="the --out of a run")
+    parser.add_argument("second", type=Path, metavar="RUN", help="the --out of the run to compare it with")
+    return parser
+
+
 def replay_parser() -> argparse.ArgumentParser:
     """Of `replay`."""
     parser = argparse.ArgumentParser(
@@ -143,9 +222,9 @@ def failures_parser() -> argparse.ArgumentParser:
     return parser
 
 
-def _add_run_options(parser: argparse.ArgumentParser) -> None:
+def _add_run_options(parser: argparse.ArgumentParser, without: Collection[str] = ()) -> None:
     add = parser.add_argument
-    _add_settings(parser, "round")
+    _add_settings(parser, "round", without)
     seeds = parser.add_mutually_exclusive_group()
     seeds.add_argument("--seed", type=_at_least(0), metavar="SEED", help="run seed (default 0)")
     seeds.add_argument("--seeds", type=_at_least(0), nargs="+", metavar="SEED", help="several run seeds, pooled")
@@ -156,7 +235,7 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="processes that play rounds; results do not depend on it (default %(default)s)",
     )
-    _add_settings(parser, "model")
+    _add_settings(parser, "model", without)
     add("--url", help="a running service (default: one is started for the run)")
     add(
         "--ray",
@@ -170,9 +249,9 @@ def _add_run_options(parser: argparse.ArgumentParser) -> None:
 # Flags from settings
 
 
-def _add_settings(parser: argparse.ArgumentParser, part: Part) -> None:
+def _add_settings(parser: argparse.ArgumentParser, part: Part, without: Collection[str] = ()) -> None:
     for name, (kind, flag) in flags().items():
-        if flag.part == part:
+        if flag.part == part and name not in without:
             default = "" if flag.default is None else " (default %(default)s)"
             parser.add_argument(
                 f"--{name.replace('_', '-')}", default=flag.default, help=flag.words + default, **_form(kind, flag)

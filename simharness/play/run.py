@@ -55,6 +55,7 @@ def run(
     ray: str | None = None,
     resume: bool,
     hooks: Hooks,
+    weights: Path | None = None,
 ) -> Run:
     """Play every round that the folder does not hold yet; a run that breaks off comes back with what was done.
 
@@ -67,6 +68,7 @@ def run(
         url: the service; None starts one for the run.
         resume: whether to continue what the folder holds.
         hooks: who is told.
+        weights: file of the model, for services that are started; None for the one that they would load by themselves.
 
     Raises:
         UsageError: the folder, the address or the model's name cannot be used, or the recorded run was another.
@@ -75,7 +77,7 @@ def run(
     stopped_by = None
     try:
         if log.todo:
-            _play(log, settings, objects, workers, url, ray, watched=hooks.event is not None)
+            _play(log, settings, objects, workers, url, ray, weights, watched=hooks.event is not None)
         else:
             log.reopen()
     except RunBroken as error:
@@ -157,6 +159,7 @@ def _play(
     workers: int,
     url: str | None,
     ray: str | None,
+    weights: Path | None,
     *,
     watched: bool,
 ) -> None:
@@ -168,13 +171,15 @@ def _play(
     """
     todo = log.todo
     with ExitStack() as stack:
-        service = stack.enter_context(LocalService(settings.model, log.service_log)) if url is None else None
+        service = None
+        if url is None:
+            service = stack.enter_context(LocalService(settings.model, log.service_log, weights=weights))
         address = service.url if service is not None else str(url)
         with _planner(address, settings) as planner:
             model, document = planner.model()
         log.open(model, Serving(url, NUM_THREADS if service is not None else None, document.get("device")))
         # On a cluster nobody reaches this machine's service, so workers there have their own.
-        task = _Rounds(settings, objects, address if ray is None else url, model, watched)
+        task = _Rounds(settings, objects, address if ray is None else url, model, watched, weights)
         rounds = stack.enter_context(crew(task, min(workers, len(todo)), ray))
         for message in _messages(rounds, todo, service):
             log.take(message)
@@ -195,6 +200,7 @@ class _Rounds:
         url: the service; None where each worker has one of its own.
         model: the network that must answer.
         watched: whether every observation and attempt is wanted.
+        weights: file of the model, for a service of the worker's own.
     """
 
     settings: RunSettings
@@ -202,6 +208,7 @@ class _Rounds:
     url: str | None
     model: ModelRecord
     watched: bool
+    weights: Path | None = None
 
     def name(self, job: _RoundKey) -> str:
         """A round in words."""
@@ -240,7 +247,8 @@ class _Rounds:
         if self.url is not None:
             return self.url
         folder = stack.enter_context(TemporaryDirectory(prefix="simharness-"))
-        return stack.enter_context(LocalService(self.settings.model, Path(folder) / SERVICE_LOG)).url
+        log = Path(folder) / SERVICE_LOG
+        return stack.enter_context(LocalService(self.settings.model, log, weights=self.weights)).url
 
     def _check(self, planner: HttpPlanner) -> None:
         if self.url is None and (model := planner.model()[0]) != self.model:

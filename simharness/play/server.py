@@ -48,12 +48,21 @@ class LocalService:
         model: the network to load.
         log: file for the service's output.
         command: what to start instead of the service.
+        weights: the network's file; None leaves it to the environment or to the weights that are installed.
     """
 
-    def __init__(self, model: str, log: Path, command: tuple[str, ...] = (sys.executable, "-m", "service")) -> None:
+    def __init__(
+        self,
+        model: str,
+        log: Path,
+        command: tuple[str, ...] = (sys.executable, "-m", "service"),
+        *,
+        weights: Path | None = None,
+    ) -> None:
         self._model = model
         self._log = log
         self._command = command
+        self._weights = weights
         self._process: subprocess.Popen[bytes] | None = None
         self.url = ""
 
@@ -111,6 +120,8 @@ class LocalService:
             "GRASP_MAX_BATCH": "1",
             "PYTHONUNBUFFERED": "1",
         }
+        if self._weights is not None:
+            environment["GRASP_WEIGHTS"] = str(self._weights)
         with self._log.open("wb") as output:
             # A session of its own: Ctrl-C in the terminal reaches the harness, which then stops the service itself.
             self._process = subprocess.Popen(

@@ -1,5 +1,7 @@
 """A service without a network, for tests of the harness: top-down grasps on the highest thing it is shown.
 
+Its second model, `heuristic`, finds none.
+
 Speaks as much of the wire as the harness uses. Started like the service (`GRASP_PORT`), or with a port of 0, which it
 then prints. `--die-after N` ends the process in the request after N answers, `--nothing` finds no grasps.
 """
@@ -79,7 +81,7 @@ class Handler(BaseHTTPRequestHandler):
             conventions = ["panda"]
             self._answer(
                 {
-                    "models": [network],
+                    "models": [network, {**network, "name": "heuristic"}],
                     "gripper": gripper,
                     "limits": limits,
                     "frame_conventions": conventions,
@@ -100,7 +102,7 @@ class Handler(BaseHTTPRequestHandler):
         body = self.rfile.read(int(self.headers["Content-Length"]))
         points = np.frombuffer(body, dtype="<f4").reshape(-1, 3).astype(np.float64)
         options = {name: json.loads(values[0]) for name, values in parse_qs(urlsplit(self.path).query).items()}
-        found = not self.options.nothing and len(points) > 10
+        found = not self.options.nothing and options["model"] == "tesnet" and len(points) > 10
         grasps = [grasp(top_down_grasp(points, options["support_height"]))] if found else []
         counts = {
             "points": len(points),
@@ -114,7 +116,7 @@ class Handler(BaseHTTPRequestHandler):
             {
                 "grasps": grasps,
                 "frame": "cloud",
-                "model": MODEL,
+                "model": {**MODEL, "name": options["model"]},
                 "counts": counts,
                 "reason": None if grasps else "no_candidates",
                 "warnings": [],

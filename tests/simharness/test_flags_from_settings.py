@@ -7,8 +7,16 @@ from typing import Any, Literal, get_args, get_origin
 import pytest
 
 from simharness.errors import UsageError
-from simharness.flags_from_settings import out_of, robustness_parser, run_parser, settings_of
+from simharness.flags_from_settings import (
+    compare_parser,
+    out_of,
+    robustness_parser,
+    run_parser,
+    settings_of,
+    trials_of,
+)
 from simharness.play.settings import RunSettings, flags
+from simharness.report.compare import Trial
 
 
 def asked(*arguments: str) -> RunSettings:
@@ -101,8 +109,50 @@ def test_flags_that_do_not_go_together_are_refused() -> None:
 
 def test_reports_go_where_they_are_wanted() -> None:
     options = run_parser().parse_args(["--out", "here"])
-    assert out_of(options, settings_of(options)) == Path("here")
-    options = run_parser().parse_args(["--scene", "pile", "--executor", "strict"])
-    found = out_of(options, settings_of(options), "robustness-")
+    assert out_of(options, "packed") == Path("here")
+    found = out_of(run_parser().parse_args([]), "robustness-pile-strict")
     assert found.parent == Path("runs")
     assert found.name.startswith("robustness-pile-strict-")
+
+
+def compared(*arguments: str) -> list[Trial]:
+    return trials_of(compare_parser().parse_args(arguments))
+
+
+def test_a_comparison_plays_every_scene_and_executor_with_every_network(tmp_path: Path) -> None:
+    path = tmp_path / "gpd-0.safetensors"
+    path.touch()
+    trials = compared(
+        "--models", f"tesnet,gpd={path}", "heuristic", "--executors", "edge", "strict", "--rounds", "7", "--out", "x"
+    )
+    assert [trial.name for trial in trials[:3]] == ["packed-edge/tesnet", "packed-edge/gpd-0", "packed-edge/heuristic"]
+    assert [trial.condition for trial in trials[::3]] == ["packed-edge", "packed-strict", "pile-edge", "pile-strict"]
+    assert [trial.contestant.weights for trial in trials[:3]] == [None, path, None]
+    assert {trial.settings.rounds for trial in trials} == {7}
+    assert trials[1].settings == asked("--model", "gpd", "--rounds", "7")
+    assert trials[-1].settings == asked(
+        "--scene", "pile", "--executor", "strict", "--model", "heuristic", "--rounds", "7"
+    )
+    assert {trial.condition for trial in compared("--models", "tesnet", "--scenes", "pile")} == {"pile-edge"}
+
+
+@pytest.mark.parametrize(
+    ("arguments", "words"),
+    [
+        (["tesnet,tesnet"], "different names"),
+        ([","], "different names"),
+        (["gpd=nowhere.safetensors"], "no file nowhere"),
+        (["gpd="], "without a name"),
+        (["tesnet", "--resume"], "--out"),
+    ],
+)
+def test_networks_that_cannot_be_compared_are_refused(arguments: list[str], words: str) -> None:
+    with pytest.raises(UsageError, match=words):
+        compared("--models", *arguments)
+
+
+def test_a_running_service_brings_its_own_weights(tmp_path: Path) -> None:
+    path = tmp_path / "gpd-0.safetensors"
+    path.touch()
+    with pytest.raises(UsageError, match="leave out --url"):
+        compared("--models", f"gpd={path}", "--url", "http://robot:8000")

@@ -7,7 +7,8 @@ from xml.etree import ElementTree as ET
 import pytest
 from PIL import Image
 
-from training.curves import COLOURS, Drawing, Panel, _scale, draw
+from simharness.drawing import COLOURS, Drawing
+from training.curves import Panel, _scale, draw
 
 NAMES = ["gpd", "tesnet <paper>"]
 

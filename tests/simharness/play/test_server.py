@@ -91,3 +91,9 @@ def test_the_service_gets_fixed_settings(tmp_path: Path, monkeypatch: pytest.Mon
         pass
     for setting in (("GRASP_HOST", "127.0.0.1"), ("GRASP_NUM_THREADS", "1"), ("GRASP_WEIGHTS", "mine.safetensors")):
         assert str(setting) in str(broken.value)
+    command = (sys.executable, "-c", show)
+    with (
+        pytest.raises(RunBroken, match=r"'GRASP_WEIGHTS', '/of/the/run\.safetensors'"),
+        LocalService("gpd", tmp_path / "log", command, weights=Path("/of/the/run.safetensors")),
+    ):
+        pass
