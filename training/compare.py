@@ -43,6 +43,7 @@ MEASURES = ("accuracy", "balanced_loss", "balanced_accuracy", "auroc", "average_
 
 _ORDER = ("heuristic", "gpd", "pointnetgpd", "edgegrasp", "gatv2", "tesnet-euclidean", "tesnet-paper", "tesnet")
 _TIMED_CLOUDS = 12
+_LOG = ".log.jsonl"
 
 
 @dataclass(frozen=True, slots=True)
@@ -50,7 +51,7 @@ class Run:
     """One trained network.
 
     Args:
-        path: its weights.
+        path: its weights, or those of the same network with another seed.
         network: its name in the registry.
         training: what its header tells of data, recipe and measures.
         epochs: lines of its log, in the order of the epochs.
@@ -93,14 +94,14 @@ def compare(data: Path, out: Path, validation: Sequence[Path] = ()) -> dict[str,
     """Writes `table1.md`, `table1.json`, `figure6.svg` and `figure6.png` to `out`; what the table says.
 
     Args:
-        data: folder of the weights that `fit` wrote and the logs beside them. Runs of one network with several seeds
-            make one line.
+        data: folder of the logs that `fit` wrote and the weights beside them. Runs of one network with several seeds
+            make one line. Weights without a log take no part.
         out: folder for the table and the figure.
         validation: folders of the labels that the runs were measured on. With them the table also has the heuristic and
             the shipped weights.
 
     Raises:
-        LabelsError: no finished run in `data`, or a log that lacks what the figure shows.
+        LabelsError: no run in `data`, or a log without weights or without what the figure shows.
         WeightsError: weights that cannot be used.
     """
     runs = read_runs(data)
@@ -120,10 +121,14 @@ def compare(data: Path, out: Path, validation: Sequence[Path] = ()) -> dict[str,
 
 
 def read_runs(data: Path) -> list[Run]:
-    """The finished epochs of every run under a folder, by network in the order of the table, then by seed."""
-    runs = [_read_run(path) for path in sorted(data.glob("*.safetensors"))]
+    """The finished epochs of every run under a folder, by network in the order of the table, then by seed.
+
+    A run is a log. Its weights have the same name; of a run NAME-SEED they may be missing where there are those of
+    NAME: the same network, trained with another seed.
+    """
+    runs = [_read_run(log) for log in sorted(data.glob(f"*{_LOG}"))]
     if not runs:
-        raise LabelsError(f"{data} holds no *.safetensors; train networks into it with `python -m training fit --out`")
+        raise LabelsError(f"{data} holds no *{_LOG}; train networks into it with `python -m training fit --out`")
     return sorted(runs, key=lambda run: (_place(run.network), run.training["seed"], run.path.name))
 
 
@@ -131,17 +136,33 @@ def _place(network: str) -> int:
     return _ORDER.index(network) if network in _ORDER else len(_ORDER)
 
 
-def _read_run(path: Path) -> Run:
-    _, header = weights.load(path)
-    log = path.with_suffix(".log.jsonl")
-    if not log.exists():
-        raise LabelsError(f"{log} is missing, which `fit` writes beside {path.name}; keep both in one folder")
+def _read_run(log: Path) -> Run:
     # A run that was stopped between its log and its checkpoint wrote an epoch's line twice.
     by_epoch = {entry["epoch"]: entry for entry in map(json.loads, log.read_text().splitlines())}
     epochs = [by_epoch[epoch] for epoch in sorted(by_epoch)]
-    if not all("with_blocked" in entry for entry in epochs) or "validation_with_blocked" not in header.training:
+    if not all("with_blocked" in entry for entry in epochs):
         raise LabelsError(f"{log} lacks measures of all candidates; it was written by an older version: train again")
-    return Run(path, header.network, header.training, epochs)
+    path, seed = _weights_of(log)
+    _, header = weights.load(path)
+    if "validation_with_blocked" not in header.training:
+        raise LabelsError(f"{path} lacks measures of all candidates; it was written by an older version: train again")
+    training = header.training
+    if seed is not None:
+        training = {**training, "seed": seed, "validation_with_blocked": epochs[-1]["with_blocked"]}
+    return Run(path, header.network, training, epochs)
+
+
+def _weights_of(log: Path) -> tuple[Path, int | None]:
+    """The weights beside a log; or those of another seed, and the seed that the log's name tells."""
+    name = log.name.removesuffix(_LOG)
+    own = log.with_name(f"{name}.safetensors")
+    if own.exists():
+        return own, None
+    network, _, seed = name.rpartition("-")
+    others = log.with_name(f"{network}.safetensors")
+    if not (seed.isdecimal() and others.exists()):
+        raise LabelsError(f"{own} is missing, which `fit` writes beside {log.name}; keep both in one folder")
+    return others, int(seed)
 
 
 def _by_network(runs: Sequence[Run]) -> list[list[Run]]:

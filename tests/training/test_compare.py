@@ -104,15 +104,30 @@ def test_an_epoch_that_was_logged_twice_counts_once(folder: Path, tmp_path: Path
 
 
 def test_a_folder_without_what_is_needed_is_refused(folder: Path, tmp_path: Path) -> None:
-    with pytest.raises(LabelsError, match=r"holds no \*\.safetensors"):
+    (tmp_path / "tesnet-0.safetensors").write_bytes((folder / "runs" / "tesnet-0.safetensors").read_bytes())
+    with pytest.raises(LabelsError, match=r"holds no \*\.log\.jsonl"):
         read_runs(tmp_path)
-    (tmp_path / "a.safetensors").write_bytes((folder / "runs" / "tesnet-0.safetensors").read_bytes())
-    with pytest.raises(LabelsError, match=r"a\.log\.jsonl is missing"):
+    (tmp_path / "a.log.jsonl").write_bytes((folder / "runs" / "tesnet-0.log.jsonl").read_bytes())
+    with pytest.raises(LabelsError, match=r"a\.safetensors is missing"):
         read_runs(tmp_path)
-    lines = [{"epoch": 1, "accuracy": 0.9}]
-    (tmp_path / "a.log.jsonl").write_text("".join(json.dumps(line) + "\n" for line in lines))
+    (tmp_path / "a.log.jsonl").write_text(json.dumps({"epoch": 1, "accuracy": 0.9}) + "\n")
     with pytest.raises(LabelsError, match="lacks measures of all candidates"):
         read_runs(tmp_path)
+
+
+def test_of_other_seeds_the_logs_are_enough(folder: Path, tmp_path: Path) -> None:
+    for source, target in (
+        ("edgegrasp-0.safetensors", "edgegrasp.safetensors"),
+        ("edgegrasp-0.log.jsonl", "edgegrasp.log.jsonl"),
+        ("edgegrasp-1.log.jsonl", "edgegrasp-1.log.jsonl"),
+        ("tesnet-0.safetensors", "shipped.safetensors"),
+    ):
+        (tmp_path / target).write_bytes((folder / "runs" / source).read_bytes())
+    found = [(run.network, run.training["seed"], run.path.name) for run in read_runs(tmp_path)]
+    assert found == [("edgegrasp", 0, "edgegrasp.safetensors"), ("edgegrasp", 1, "edgegrasp.safetensors")]
+    assert [run.epochs for run in read_runs(tmp_path)] == [run.epochs for run in read_runs(folder / "runs")][:2]
+    measured = [run.training["validation_with_blocked"] for run in read_runs(folder / "runs")][:2]
+    assert [run.training["validation_with_blocked"] for run in read_runs(tmp_path)] == measured
 
 
 def test_the_network_takes_a_part_of_the_time() -> None:
