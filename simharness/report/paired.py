@@ -124,7 +124,7 @@ def _differences(counts: NDArray[np.float64], rng: np.random.Generator) -> tuple
 
 def _difference(sums: NDArray[np.float64]) -> Difference:
     """Of two rates, from counts and totals of both (samples, 4); the first sample is what was observed."""
-    counted = (sums[:, [1, 3]] > 0).all(axis=1)
+    counted = np.minimum(sums[:, 1], sums[:, 3]) > 0
     if not counted[0]:
         return Difference(None, None)
     of_first, first_total, of_second, second_total = sums[counted].T
