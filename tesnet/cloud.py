@@ -12,6 +12,7 @@ import numpy as np
 import torch
 from torch import Tensor
 
+from tesnet import smoothing
 from tesnet.geometry import Box, Pose
 from tesnet.obstacles import Obstacles
 from tesnet.orientation import orient
@@ -31,6 +32,13 @@ MINIMUM_POINTS = 32
 
 SUPPORT_NOISE = 0.005
 """Points lower than this above the support plane are the plane's own, as a camera sees it, and are dropped."""
+
+MOST_SUPPORT_NOISE = 0.010
+"""Where preparation follows the noise, no more than this above the support plane is dropped as its noise."""
+
+_DEVIATIONS = 3.0
+_FEWEST_BELOW = 200
+_NEAR_SUPPORT = 0.03
 
 MOST_ON_SUPPORT = 5_000
 """Of what stands on a support that was found, so many prepared points, the nearest to the camera: enough for any grasp,
@@ -60,6 +68,8 @@ class PreparationConfig:
         graph_neighbours: k of the kNN graph, the point itself included.
         max_points: larger prepared clouds are cropped to the points nearest their median.
         max_extent: points farther than this from the median of the cloud are ignored.
+        smooth_above: standard deviation of the noise above which surfaces are smoothed; flying pixels are then looked
+            for, and what the support's noise lifts is dropped, too. None: all that is left as it is.
     """
 
     voxel_size: float = 0.0045
@@ -70,6 +80,7 @@ class PreparationConfig:
     graph_neighbours: int = 16
     max_points: int = 12_000
     max_extent: float = 10.0
+    smooth_above: float | None = None
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -128,7 +139,11 @@ def prepare(
             are looked for on what stands on it, the rest counts for collision.
     """
     noise = SUPPORT_NOISE if support is None else max(SUPPORT_NOISE, support.clearance)
-    posted = above_support(_columns(query).to(device), query, noise)
+    posted, support_sd = _columns(query).to(device), 0.0
+    if config.smooth_above is not None:
+        support_sd = _support_sd(posted, query) if support is None else support.noise_sd
+        noise = max(noise, min(_DEVIATIONS * support_sd, MOST_SUPPORT_NOISE))
+    posted = above_support(posted, query, noise)
     sought, on_things = in_workspace(posted, query), False
     if support is not None and query.target is None:
         things = sought & torch.from_numpy(region(posted[:, :3].cpu().numpy(), support)).to(device)
@@ -149,7 +164,8 @@ def prepare(
     def to_canonical(positions: Tensor) -> Tensor:
         return in_canonical_frame(positions, T_cloud_canonical)
 
-    table = voxel_downsample(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config.voxel_size)
+    table = _quieter(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config, support_sd)
+    table = voxel_downsample(table, config.voxel_size)
     a_cell = len(points) / len(table)
     viewpoints = to_canonical(viewpoints).to(device)
     on_target = _on_target(query, table, T_cloud_canonical)
@@ -189,6 +205,26 @@ def prepare(
         dropped_far=dropped_far,
         dropped_surplus=int((~kept).sum()),
     )
+
+
+def _support_sd(points: Tensor, query: GraspQuery) -> float:
+    """Standard deviation of the support's rows (N, 3 or more) about its known plane, by those under it; 0 if unseen."""
+    if query.known_up is None or not isinstance(query.support_height, float):
+        return 0.0
+    heights = points[:, :3] @ torch.tensor(query.known_up, dtype=points.dtype, device=points.device)
+    below = query.support_height - heights
+    below = below[(below >= 0) & (below <= _NEAR_SUPPORT)]
+    return 1.4826 * float(below.median()) if len(below) >= _FEWEST_BELOW else 0.0
+
+
+def _quieter(table: Tensor, config: PreparationConfig, support_sd: float) -> Tensor:
+    """Rows (N, 3 or more), beginning with x, y, z, as the configuration wants them where they are noisy."""
+    if config.smooth_above is None or not MINIMUM_POINTS <= len(table) <= smoothing.MOST_POINTS:
+        return table
+    noise = smoothing.measured(table[:, :3])
+    table = smoothing.without_lone(table, noise)
+    sd = max(noise.sd, support_sd)
+    return smoothing.smoothed(table, sd) if sd > config.smooth_above and len(table) else table
 
 
 def _columns(query: GraspQuery) -> Tensor:

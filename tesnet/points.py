@@ -24,13 +24,17 @@ def voxel_downsample(points: Tensor, voxel_size: float) -> Tensor:
 
     The grid's corner lies half a cell below the smallest coordinates, as in Open3D.
     """
+    return cells_of(points, voxel_size)[0]
+
+
+def cells_of(points: Tensor, voxel_size: float) -> tuple[Tensor, Tensor]:
+    """The means of `voxel_downsample`, and how many rows each is of."""
     corner = points[:, :3].min(dim=0).values
     cells = ((points[:, :3] - corner) / voxel_size + 0.5).floor().long()
     cell_of_point, counts = members_of_cells(cells)
     sums = torch.zeros(len(counts), points.shape[1], dtype=torch.float64, device=points.device)
     sums.index_add_(0, cell_of_point, points.double())
-    means: Tensor = (sums / counts[:, None]).to(points.dtype)
-    return means
+    return (sums / counts[:, None]).to(points.dtype), counts
 
 
 def members_of_cells(cells: Tensor) -> tuple[Tensor, Tensor]:

@@ -95,6 +95,12 @@ def _sensor(name: SensorName, label: str = "") -> Condition:
     return Condition(f"sensor-{name}", label or name, {"sensor": name})
 
 
+def _calibrated(condition: Condition) -> Condition:
+    return Condition(
+        f"{condition.name}-calibrated", f"{condition.label}, calibrated", {**condition.changes, "calibrate": True}
+    )
+
+
 _UNCHANGED = "unchanged"
 _NO_NOISE = Condition("noise-0", "none", {"noise_std": 0.0})
 _DEX = Condition("noise-giga", "giga's", {"noise_std": 0.0, "dex_noise": True})
@@ -121,12 +127,14 @@ AXES: Mapping[AxisName, Axis] = {
             _sensor("d415"),
             _sensor("d435"),
             _sensor("d435-pose", "d435, pose"),
+            _calibrated(_sensor("d435-pose", "d435, pose")),
             _sensor("d435-uncalibrated", "d435, all"),
             _sensor("tof"),
             _sensor("simkinect"),
             _sensor("redwood"),
             _sensor("patches"),
             replace(_DEX, label="dex"),
+            _calibrated(replace(_DEX, label="dex")),
         ),
         joined=0,
     ),

@@ -1,0 +1,117 @@
+"""What clouds of noisy cameras need before anything is made of them: lone points dropped, surfaces made thin again.
+
+Knows no query and no sensor: how noisy a cloud is, is measured on its points. Vectorised torch on the device of its
+inputs; lengths in metres.
+"""
+
+from __future__ import annotations
+
+from dataclasses import dataclass
+
+import torch
+from torch import Tensor
+
+from tesnet.points import cells_of, nearest_neighbours, smallest_eigenvector
+
+MOST_LONE = 0.0125
+"""Share of lone points from which on they are flying pixels. Of quiet clouds 0.4 % are lone, on surfaces at a slant."""
+
+MOST_POINTS = 40_000
+"""Larger clouds stay as they are: their neighbours would take longer to find than the answer."""
+
+_SAMPLE = 400
+_LONE_RADIUS = 0.006
+_LONE_SHARE = 0.06
+"""A lone point has at most so large a part of the median number of others within `_LONE_RADIUS`."""
+_FLAT_RADIUS = 0.008
+"""Wide against the noise that is worth smoothing, narrow against the bend of things that are grasped."""
+_FEWEST = 12
+_QUARTER = 0.25
+"""Of the sampled residuals, from the least: that of surfaces which are flat there."""
+
+_FINE, _COARSE = 0.003, 0.005
+"""Edges of the cells that are moved, and of those that planes are fitted to."""
+_NEIGHBOURS = 48
+_WIDTHS = (0.006, 0.010)
+_DEVIATIONS = 3.0
+"""The window's standard deviation is so many of the noise's, within `_WIDTHS`."""
+_LEAST_WEIGHT = 0.25
+"""Of the median: points that weigh less in their own window fly."""
+
+
+@dataclass(frozen=True, slots=True)
+class Noise:
+    """How noisy a cloud is.
+
+    Args:
+        sd: of points about their surface, metres: the lower quartile of what is left of planes in balls of 8 mm. Noise
+            that is alike over more than that does not show.
+        lone: share of points that have hardly another one nearby.
+        crowd: others within 6 mm of a point, the median.
+    """
+
+    sd: float
+    lone: float
+    crowd: float
+
+
+def measured(points: Tensor) -> Noise:
+    """The noise of a cloud (P, 3), by a sample of its points spread evenly over their order."""
+    cloud = points - points.mean(dim=0)
+    rows = torch.linspace(0, len(points) - 1, min(_SAMPLE, len(points)), device=points.device).long()
+    lengths = cloud.square().sum(dim=1)
+    squares = torch.addmm(lengths[None], cloud[rows], cloud.T, alpha=-2) + lengths[rows, None]
+    others = (squares <= _LONE_RADIUS**2).sum(dim=1) - 1
+    crowd = float(others.float().median())
+    # Of a sparse cloud every point is alone.
+    lone = float((others <= _LONE_SHARE * crowd).float().mean()) if _LONE_SHARE * crowd >= 1 else 0.0
+    near = (squares[::2] <= _FLAT_RADIUS**2).double()
+    counts = near.sum(dim=1)
+    near, counts = near[counts >= _FEWEST], counts[counts >= _FEWEST, None]
+    if len(counts) == 0:
+        return Noise(0.0, lone, crowd)
+    exact = cloud.double()
+    means = near @ exact / counts
+    moments = (near @ (exact[:, :, None] * exact[:, None, :]).flatten(1) / counts).view(-1, 3, 3)
+    least, _ = smallest_eigenvector(moments - means[:, :, None] * means[:, None, :])
+    variances = least[:, 0] * counts[:, 0] / (counts[:, 0] - 3)  # three numbers make a plane
+    return Noise(float(variances.sqrt().quantile(_QUARTER)), lone, crowd)
+
+
+def without_lone(table: Tensor, noise: Noise) -> Tensor:
+    """The rows (N, 3 or more), which begin with x, y, z, without flying pixels, where there are any."""
+    if noise.lone <= MOST_LONE:
+        return table
+    fewest = int(_LONE_SHARE * noise.crowd) + 1
+    points = table[:, :3].contiguous()
+    farthest = points[nearest_neighbours(points, fewest + 1)[:, -1]]
+    return table[(farthest - points).norm(dim=1) <= _LONE_RADIUS]
+
+
+def smoothed(table: Tensor, sd: float) -> Tensor:
+    """Rows (M, 3 or more) that lie on planes fitted to the rows (N, 3 or more) about them, a row for each cell of 3 mm.
+
+    A window weighs cells of 5 mm by their rows and by their distance; its width follows the noise. Cells with little
+    in their window are dropped.
+
+    Args:
+        table: begins with x, y, z; what follows is averaged.
+        sd: of the noise, metres.
+    """
+    width = min(max(_DEVIATIONS * sd, _WIDTHS[0]), _WIDTHS[1])
+    fine, _ = cells_of(table, _FINE)
+    samples, sizes = cells_of(table[:, :3], _COARSE)
+    near = nearest_neighbours(samples, min(_NEIGHBOURS, len(samples)), fine[:, :3].contiguous())
+    points = fine[:, :3].double()
+    offsets = samples.double()[near] - points[:, None]
+    squares = offsets.square().sum(dim=2)
+    weights = sizes[near] * torch.exp(-squares / (2 * width**2)) * (squares <= 4 * width**2)
+    total = weights.sum(dim=1)
+    kept = total >= _LEAST_WEIGHT * total.median()
+    offsets, weights, total = offsets[kept], weights[kept], total[kept, None]
+    means = (offsets * weights[..., None]).sum(dim=1) / total
+    centred = offsets - means[:, None]
+    covariances = (centred * weights[..., None]).transpose(1, 2) @ centred / total[..., None]
+    _, normals = smallest_eigenvector(covariances)
+    moved = points[kept] + (means * normals).sum(dim=1, keepdim=True) * normals
+    return torch.cat([moved.to(table.dtype), fine[kept, 3:]], dim=1)

@@ -1,0 +1,135 @@
+"""Noisy clouds: how noisy they are, what flies, and what smoothing leaves."""
+
+from __future__ import annotations
+
+from dataclasses import replace
+
+import numpy as np
+import pytest
+import torch
+from torch import Tensor
+
+from tesnet import smoothing
+from tesnet.cloud import PreparationConfig, PreparedCloud, prepare
+from tesnet.geometry import Pose
+from tesnet.points import nearest_neighbours
+from tests.tesnet.scenes import CAMERA, CPU, moved_query, tabletop, tabletop_query
+from tests.tesnet.test_support import table
+
+FOLLOWING = PreparationConfig(smooth_above=0.0011)
+
+
+def noisy(sd: float, seed: int = 0) -> np.ndarray:
+    points = tabletop(seed, noise=0.0)
+    return points + np.random.default_rng(seed).normal(0, sd, points.shape)
+
+
+def prepared(points: np.ndarray, config: PreparationConfig = FOLLOWING) -> PreparedCloud:
+    found = prepare(replace(tabletop_query(), points=points), config, CPU)
+    assert found is not None
+    return found
+
+
+def flying(count: int, seed: int = 0) -> np.ndarray:
+    """Points in the air behind things, along the camera's rays."""
+    rng = np.random.default_rng(seed)
+    edges = tabletop(seed, noise=0.0)
+    edges = edges[rng.choice(len(edges), count)]
+    return CAMERA + (edges - CAMERA) * rng.uniform(0.75, 0.95, (count, 1))
+
+
+@pytest.mark.parametrize("sd", [0.0008, 0.0015, 0.002])
+def test_noise_is_measured_within_a_fifth(sd: float) -> None:
+    found = smoothing.measured(torch.from_numpy(noisy(sd)).float())
+    assert found.sd == pytest.approx(sd, rel=0.2)
+    assert found.lone <= 0.005
+
+
+def test_noise_is_measured_more_where_there_is_more() -> None:
+    deviations = [smoothing.measured(torch.from_numpy(noisy(sd)).float()).sd for sd in (0.0, 0.001, 0.002, 0.004)]
+    assert deviations == sorted(deviations)
+    assert deviations[0] < 0.0003
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("sd", [0.0, 0.0004, 0.0008])
+def test_quiet_clouds_stay_bit_for_bit(seed: int, sd: float) -> None:
+    points = noisy(sd, seed)
+    with_table = np.concatenate([points, table(0.2)])
+    with_table += np.random.default_rng(seed).normal(0, sd, with_table.shape)
+    for cloud in (points, with_table if sd < 0.0006 else points):
+        following, plain = prepared(cloud), prepared(cloud, PreparationConfig())
+        assert torch.equal(following.points, plain.points)
+        assert torch.equal(following.normals, plain.normals)
+
+
+@pytest.mark.parametrize("sd", [0.002, 0.004])
+def test_a_noisy_surface_gets_thin_and_its_normals_right(sd: float) -> None:
+    truth = prepared(tabletop(0, noise=0.0), PreparationConfig())
+
+    def errors(config: PreparationConfig) -> tuple[float, float]:
+        found = prepared(noisy(sd), config)
+        points = _in_cloud(found)
+        nearest = nearest_neighbours(_in_cloud(truth), 1, points)[:, 0]
+        normals = found.normals @ torch.tensor(found.T_cloud_canonical.rotation.T).float()
+        true = truth.normals[nearest] @ torch.tensor(truth.T_cloud_canonical.rotation.T).float()
+        surface = torch.from_numpy(tabletop(0, noise=0.0)).float()
+        distance = (points - surface[nearest_neighbours(surface, 1, points)[:, 0]]).norm(dim=1)
+        return float(distance.median()), float((normals * true).sum(dim=1).clamp(-1, 1).arccos().rad2deg().median())
+
+    (far, aslant), (far_before, aslant_before) = errors(FOLLOWING), errors(PreparationConfig())
+    assert far < 0.6 * far_before
+    assert aslant < 0.5 * aslant_before
+
+
+def _in_cloud(found: PreparedCloud) -> Tensor:
+    return torch.from_numpy(found.T_cloud_canonical.apply(found.points.numpy())).float()
+
+
+def test_flying_pixels_go_and_the_others_stay() -> None:
+    right, wrong = noisy(0.0008), flying(500)
+    table_of_points = torch.from_numpy(np.concatenate([right, wrong])).float()
+    rows = torch.cat([table_of_points, torch.arange(len(table_of_points))[:, None].float()], dim=1)
+    kept = smoothing.without_lone(rows, smoothing.measured(table_of_points))[:, 3].long().numpy()
+    assert (kept >= len(right)).sum() < 0.25 * len(wrong)
+    assert (kept < len(right)).sum() > 0.99 * len(right)
+
+
+def test_a_cloud_whose_points_all_lie_apart_flies_nowhere() -> None:
+    sparse = torch.from_numpy(np.random.default_rng(0).uniform(0, 0.2, (500, 3))).float()
+    noise = smoothing.measured(sparse)
+    assert noise.lone == 0.0
+    assert torch.equal(smoothing.without_lone(sparse, noise), sparse)
+
+
+def test_what_follows_the_coordinates_is_averaged() -> None:
+    points = torch.from_numpy(noisy(0.002)).float()
+    rows = torch.cat([points, (points[:, :1] > 0).float()], dim=1)
+    found = smoothing.smoothed(rows, 0.002)
+    assert found.shape[1] == 4
+    assert bool((found[found[:, 0] > 0.005, 3] == 1).all())
+    assert bool((found[found[:, 0] < -0.005, 3] == 0).all())
+
+
+def test_a_smoothed_cloud_moves_with_its_frame() -> None:
+    query = replace(tabletop_query(), points=noisy(0.003), workspace=None)
+    moved = moved_query(query, Pose.random(np.random.default_rng(1), reach=0.3))
+    here, there = prepare(query, FOLLOWING, CPU), prepare(moved, FOLLOWING, CPU)
+    assert here is not None
+    assert there is not None
+    assert abs(len(here) - len(there)) <= 0.01 * len(here)
+    distance = (here.points[nearest_neighbours(here.points, 1, there.points)[:, 0]] - there.points).norm(dim=1)
+    assert float(distance.quantile(0.95)) < 0.0005
+
+
+@pytest.mark.parametrize("sd", [0.002, 0.004])
+def test_of_a_table_in_view_what_its_noise_lifts_is_dropped(sd: float) -> None:
+    points = np.concatenate([tabletop(0, noise=0.0), table(0.2)])
+    points += np.random.default_rng(0).normal(0, sd, points.shape)
+    limit = min(3 * sd, 0.010)
+    heights = _in_cloud(prepared(points))[:, 2]
+    assert float(heights.min()) > limit - 0.003
+
+
+def test_files_without_the_setting_leave_clouds_as_they_are() -> None:
+    assert PreparationConfig(voxel_size=0.0045).smooth_above is None
