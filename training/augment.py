@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from dataclasses import fields, replace
+from typing import Any
 
 import numpy as np
 import torch
@@ -66,8 +67,9 @@ def _cut_off(view: LabelledView, rng: np.random.Generator) -> LabelledView:
 
 def _only(view: LabelledView, which: torch.Tensor) -> LabelledView:
     """The view with the candidates at the indices (K,) alone: all its tensors have a row for each."""
-    values = {item.name: getattr(view, item.name) for item in fields(view)}
-    return replace(view, **{key: value[which] for key, value in values.items() if isinstance(value, torch.Tensor)})
+    values: dict[str, Any] = {item.name: getattr(view, item.name) for item in fields(view)}
+    rows: dict[str, Any] = {name: value[which] for name, value in values.items() if isinstance(value, torch.Tensor)}
+    return replace(view, **rows)
 
 
 def _with_table(cloud: PreparedCloud, rng: np.random.Generator) -> PreparedCloud:

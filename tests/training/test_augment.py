@@ -88,7 +88,8 @@ def test_a_new_side_leaves_what_lies_within_it_and_the_candidates_of_that() -> N
         cloud, found = view.cloud, view.candidates
         side = cloud.sides[-1]
         assert len(cloud.sides) == len(VIEW.cloud.sides) + 1
-        assert abs(float(side[:3] @ cloud.up)) < 1e-5  # type: ignore[arg-type]  # it is known
+        assert cloud.up is not None
+        assert abs(float(side[:3] @ cloud.up)) < 1e-5
         assert (cloud.points @ side[:3] <= side[3]).all()
         dropped = (VIEW.cloud.points @ side[:3] > side[3]).sum()
         assert len(cloud) + int(dropped) == len(VIEW.cloud)

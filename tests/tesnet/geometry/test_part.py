@@ -16,7 +16,7 @@ from scipy.spatial import ConvexHull
 from tesnet import collision
 from tesnet.geometry import PANDA, Extent, Gripper, Part
 from tesnet.geometry.part import ROUNDED
-from tesnet.networks import tesnet
+from tesnet.networks import around_hand
 
 Array = NDArray[np.float64]
 
@@ -114,8 +114,8 @@ def test_the_samples_for_the_shadow_lie_in_their_part(hand: Gripper, share: floa
 
 
 def test_the_networks_probes_lie_in_and_before_the_open_hand() -> None:
-    probes = tesnet._probes(PANDA).double().numpy()
-    ends = tesnet._ends(PANDA).double().numpy()
+    probes = around_hand.probes(PANDA).open.double().numpy()
+    ends = around_hand.ends(PANDA).open.double().numpy()
     fingers, between, ahead, behind = np.split(probes, [60, 90, 95])
     by_part = [depth(fingers, part, PANDA.max_width) for part in PANDA.parts[:2]]
     # Probes at the outside of the tapered finger lie up to 10 mm beside it.

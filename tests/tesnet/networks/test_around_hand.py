@@ -58,14 +58,17 @@ def test_there_are_as_many_probes_as_said_on_both_sides_alike(hand: Gripper) -> 
         assert torch.cdist(places * torch.tensor(flip), places).amin(dim=1).max() < 1e-4
 
 
+def in_hand(places: torch.Tensor, hand: Gripper, width: float) -> torch.Tensor:
+    x, y, z = places.unbind(dim=1)
+    return inside_hand(x, y, z, hand, width)
+
+
 def test_probes_lie_in_fingers_and_palm_however_far_the_hand_is_open(hand: Gripper) -> None:
     inner = [row for row in range(60) if row % 3 == 0 and row % 15 not in (0, 12)]  # neither at the tip nor the root
     for width, places in zip(some_widths(hand).tolist(), probes(hand).of(opened(hand, some_widths(hand))), strict=True):
-        assert inside_hand(*places[inner].unbind(dim=1), hand, width).all()
-        palm = places[-10:] * torch.tensor([0.5, 1.0, 1.0])
-        assert inside_hand(*palm.unbind(dim=1), hand, width).all()
-        between = places[60:90]
-        assert not inside_hand(*between.unbind(dim=1), hand, width).any()
+        assert in_hand(places[inner], hand, width).all()
+        assert in_hand(places[-10:] * torch.tensor([0.5, 1.0, 1.0]), hand, width).all()
+        assert not in_hand(places[60:90], hand, width).any()
 
 
 def test_a_region_reaches_as_far_past_each_part_as_the_frankas(hand: Gripper) -> None:
