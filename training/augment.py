@@ -3,8 +3,7 @@
 from __future__ import annotations
 
 import math
-from dataclasses import fields, replace
-from typing import Any
+from dataclasses import replace
 
 import numpy as np
 import torch
@@ -61,15 +60,8 @@ def _cut_off(view: LabelledView, rng: np.random.Generator) -> LabelledView:
     of_points = {name: getattr(cloud, name)[keep] for name in ("normals", "spectrum", "view_directions")}
     side = torch.cat([outward, distance[None]])
     cut = replace(cloud, points=points, neighbours=neighbours, sides=torch.cat([cloud.sides, side[None]]), **of_points)
-    left = _only(view, which)
+    left = view.only(which)
     return replace(left, cloud=cut, approach=row[left.approach], contact=row[left.contact])
-
-
-def _only(view: LabelledView, which: torch.Tensor) -> LabelledView:
-    """The view with the candidates at the indices (K,) alone: all its tensors have a row for each."""
-    values: dict[str, Any] = {item.name: getattr(view, item.name) for item in fields(view)}
-    rows: dict[str, Any] = {name: value[which] for name, value in values.items() if isinstance(value, torch.Tensor)}
-    return replace(view, **rows)
 
 
 def _with_table(cloud: PreparedCloud, rng: np.random.Generator) -> PreparedCloud:

@@ -35,7 +35,8 @@ def flying(count: int, seed: int = 0) -> np.ndarray:
     rng = np.random.default_rng(seed)
     edges = tabletop(seed, noise=0.0)
     edges = edges[rng.choice(len(edges), count)]
-    return CAMERA + (edges - CAMERA) * rng.uniform(0.75, 0.95, (count, 1))
+    places: np.ndarray = CAMERA + (edges - CAMERA) * rng.uniform(0.75, 0.95, (count, 1))
+    return places
 
 
 @pytest.mark.parametrize("sd", [0.0008, 0.0015, 0.002])

@@ -106,7 +106,7 @@ def test_a_new_side_leaves_what_lies_within_it_and_the_candidates_of_that() -> N
 
 
 def test_a_view_of_which_no_candidate_would_stay_is_left_whole() -> None:
-    alone = augmenting._only(VIEW, torch.tensor([0]))
+    alone = VIEW.only(torch.tensor([0]))
     for seed in range(12):
         view = augmenting._cut_off(alone, np.random.default_rng(seed))
         assert len(view.outcomes) == 1
