@@ -132,6 +132,7 @@ def test_clouds_of_another_preparation_are_refused(tmp_path: Path) -> None:
 def test_clouds_that_differ_in_any_part_of_their_preparation_are_refused(tmp_path: Path, name: str) -> None:
     """Such as normals of 16 neighbours, where the service fits them to 14."""
     value = asdict(PreparationConfig())[name]
-    save_scene(tmp_path / "scene_0.npz", {}, [labelled_view(count=30)], PreparationConfig(**{name: value + 2}))
-    with pytest.raises(LabelsError, match=f"{name} is {value + 2}, not {value}"):
+    other = 2 if value is None else value + 2
+    save_scene(tmp_path / "scene_0.npz", {}, [labelled_view(count=30)], PreparationConfig(**{name: other}))
+    with pytest.raises(LabelsError, match=f"{name} is {other}, not {value}"):
         list(load_views([tmp_path], PreparationConfig()))
