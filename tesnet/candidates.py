@@ -17,10 +17,11 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 
+from tesnet.clearance import stopping_short
 from tesnet.cloud import PreparedCloud
 from tesnet.fitting import fitted
 from tesnet.geometry import PANDA, Gripper
-from tesnet.outline import Outline, outline
+from tesnet.outline import Outline, is_low, outline
 from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
 
 TIP_BEYOND_CONTACT = 0.007
@@ -32,11 +33,8 @@ _STEEPEST_RISE = 0.95
 _FARTHEST_ASIDE = 0.005
 """Metres; contact points of shallow pairs lie no farther beside the plane in which the fingers close."""
 
-_FEW = 100
-"""With fewer candidates on a support plane those of low things are added."""
-
-_LEAST_REACH = 0.005
-"""Metres; tips that reach less far past a face slip off it."""
+_UPWARD = 0.5
+"""The face of a low thing: the cosine of its normal with `up` is at least this."""
 
 _ROUNDING = 1e-5
 
@@ -145,8 +143,8 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
         if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
             break
         count = more_approach_points(count)
-    for others in _without_walls(cloud, query, config, approach_points, int(alive.sum())):
-        also_alive, also_rejected = _judge(cloud, query, config, others)
+    for made in _without_walls(cloud, query, config, approach_points, int(alive.sum())):
+        others, also_alive, also_rejected = _judge(cloud, query, config, made)
         candidates, alive = candidates.joined_by(others), torch.cat([alive, also_alive])
         rejected = {name: count + also_rejected[name] for name, count in rejected.items()}
     survivors = alive.nonzero()[:, 0]
@@ -191,13 +189,16 @@ def _search(
     approach, contact = pairs_in_reach(cloud.points, normals, approach_points, config)
     poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact], hand=query.gripper)
     candidates = Candidates(approach, contact, poses, wide_open(poses, query.gripper), query.gripper)
-    return candidates, *_judge(cloud, query, config, candidates)
+    return _judge(cloud, query, config, candidates)
 
 
 def _fitted(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates) -> Candidates:
     """The candidates as wide as asked and midway between their walls, but for those that would come too low there."""
     moved = fitted(cloud, candidates, query.gripper, centred=config.centred, policy=query.width)
-    low = _too_low(cloud, moved, query.gripper, config)
+    before, after = (
+        hand_clearance(cloud, some.Ts_canonical_grasp, query.gripper, some.widths) for some in (candidates, moved)
+    )
+    low = after < before.clamp(max=config.support_clearance) - _ROUNDING
     return replace(
         moved,
         Ts_canonical_grasp=torch.where(low[:, None, None], candidates.Ts_canonical_grasp, moved.Ts_canonical_grasp),
@@ -207,13 +208,14 @@ def _fitted(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, ca
 
 def _judge(
     cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates
-) -> tuple[Tensor, dict[str, int]]:
-    """A mask of the candidates that no rule drops, and how many each rule does."""
+) -> tuple[Candidates, Tensor, dict[str, int]]:
+    """The candidates, clear of the support, a mask of those that no rule drops, and how many each rule does."""
+    candidates, too_near = clear_of_support(cloud, candidates, query.gripper, config)
     poses = candidates.Ts_canonical_grasp
     masks = {
         "from_below": _comes_from_behind(cloud, candidates, config),
         "approach": _outside_cone(cloud, poses[:, :3, 2], query),
-        "support": _too_low(cloud, candidates, query.gripper, config),
+        "support": too_near,
         "target": _off_target(cloud, candidates.contact),
     }
     rejected = {}
@@ -221,7 +223,30 @@ def _judge(
     for name, bad in masks.items():
         rejected[name] = int((bad & alive).sum())
         alive &= ~bad
-    return alive, rejected
+    return candidates, alive, rejected
+
+
+def clear_of_support(
+    cloud: PreparedCloud, candidates: Candidates, hand: Gripper, config: CandidateConfig
+) -> tuple[Candidates, Tensor]:
+    """The candidates, those stopped short that come too near to the support, and a mask of those that still do."""
+    poses = candidates.Ts_canonical_grasp
+    clearance = hand_clearance(cloud, poses, hand, candidates.widths)
+    if cloud.up is None or cloud.support_height is None:
+        return candidates, torch.zeros_like(clearance, dtype=torch.bool)
+    travel = poses[:, :3, 2]
+    reach = ((poses[:, :3, 3] - cloud.points[candidates.approach]) * travel).sum(dim=1) + hand.tip_offset
+    back, too_near = stopping_short(
+        -(travel @ cloud.up),
+        clearance,
+        reach,
+        wanted=config.support_clearance,
+        error=cloud.support_error,
+        farthest=TIP_BEYOND_CONTACT,
+    )
+    poses = poses.clone()
+    poses[:, :3, 3] -= back[:, None] * travel
+    return replace(candidates, Ts_canonical_grasp=poses), too_near
 
 
 def _without_walls(
@@ -230,17 +255,20 @@ def _without_walls(
     """The candidates that do without a wall to measure depth on, beside `count` of those that have one.
 
     On the outline of faces seen from straight above the outward direction of the edge stands for the contact normal.
-    Without `up` such faces cannot be told from others, and low things only stand on a known plane: there, these
-    candidates are for want of others.
+    Without `up` such faces cannot be told from others: there, these candidates are for want of others. Low things are
+    those over a known plane whose walls are too low to measure a depth on.
     """
     if cloud.up is not None or count == 0:
         edges = outline(cloud, query)
         if len(edges.points):
             depths = (config.min_offset, config.max_depth)
             yield _along_travel(cloud, query.gripper, config, approach_points, edges, depths)
-    if cloud.up is not None and cloud.support_height is not None and count < _FEW:
-        walls = _low_walls(cloud, cloud.up)
-        yield _along_travel(cloud, query.gripper, config, approach_points, walls, (0.0, config.min_depth))
+    if cloud.up is not None:
+        low_faces = is_low(cloud) & (cloud.normals @ cloud.up >= _UPWARD)
+        low = approach_points[low_faces[approach_points]]
+        if len(low):
+            walls = _low_walls(cloud, cloud.up)
+            yield _along_travel(cloud, query.gripper, config, low, walls, (0.0, config.min_depth))
 
 
 def _low_walls(cloud: PreparedCloud, up: Tensor) -> Outline:
@@ -264,8 +292,7 @@ def _along_travel(
 ) -> Candidates:
     """Pairs of approach points with edges whose directions of closing and travel are known.
 
-    Depth, along the travel, lies from the first of `depths` to below the second. A hand that would come too near to the
-    support stops short of it, if its tips still reach `_LEAST_REACH` past the approach point.
+    Depth, along the travel, lies from the first of `depths` to below the second.
     """
     found = []
     for some in approach_points.split(max(1, _PAIRS_AT_ONCE // max(1, len(edges.points)))):
@@ -287,12 +314,7 @@ def _along_travel(
     approach, edge = (torch.cat(parts) for parts in zip(*found, strict=True))
     contact, closing, travel = edges.points[edge], edges.outward[edge], edges.travel[edge]
     poses = poses_along(cloud.points[approach], cloud.points[contact], closing, travel, hand=hand)
-    opened = wide_open(poses, hand)
-    too_low = config.support_clearance + _ROUNDING - hand_clearance(cloud, poses, hand, opened)
-    reach = ((poses[:, :3, 3] - cloud.points[approach]) * travel).sum(dim=1) + hand.tip_offset
-    lift = torch.where(reach - too_low >= _LEAST_REACH, too_low.clamp(min=0), 0.0)
-    poses[:, :3, 3] -= lift[:, None] * travel
-    return Candidates(approach, contact, poses, opened, hand)
+    return Candidates(approach, contact, poses, wide_open(poses, hand), hand)
 
 
 def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
@@ -454,11 +476,6 @@ def _clearance(cloud: PreparedCloud, poses: Tensor, places: NDArray[np.float64])
     up_in_grasp = (poses[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
     tcp_height = poses[:, :3, 3] @ cloud.up - cloud.support_height
     return tcp_height + (up_in_grasp @ corners.T).min(dim=1).values
-
-
-def _too_low(cloud: PreparedCloud, candidates: Candidates, hand: Gripper, config: CandidateConfig) -> Tensor:
-    clearance = hand_clearance(cloud, candidates.Ts_canonical_grasp, hand, candidates.widths)
-    return clearance < config.support_clearance
 
 
 def _comes_from_behind(cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig) -> Tensor:

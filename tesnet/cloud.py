@@ -103,6 +103,8 @@ class PreparedCloud:
         unsought: what else was posted near the points, outside the workspace or beyond `max_points`, on the same grid:
             no grasp is looked for there, but the hand must not meet it.
         dropped_far, dropped_surplus: points ignored because of `max_extent` and of `max_points`.
+        support_error: how far the support plane may be from where it is taken to be, metres; a height that was given is
+            taken to be right.
     """
 
     points: Tensor
@@ -119,6 +121,7 @@ class PreparedCloud:
     unsought: Obstacles | None = None
     dropped_far: int = 0
     dropped_surplus: int = 0
+    support_error: float = 0.0
 
     def __len__(self) -> int:
         return len(self.points)
@@ -204,6 +207,7 @@ def prepare(
         unsought=_unsought(points, others, config.voxel_size, a_cell),
         dropped_far=dropped_far,
         dropped_surplus=int((~kept).sum()),
+        support_error=0.0 if support is None else support.noise_sd,
     )
 
 
