@@ -8,8 +8,9 @@ canonical frame.
 from __future__ import annotations
 
 import math
-from collections.abc import Iterator, Mapping
+from collections.abc import Callable, Iterator, Mapping
 from dataclasses import dataclass, replace
+from functools import partial
 from typing import Any
 
 import numpy as np
@@ -122,11 +123,19 @@ class Candidates:
         )
 
 
-def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -> tuple[Candidates, dict[str, int]]:
+def generate(
+    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, edges: Callable[[], Outline] | None = None
+) -> tuple[Candidates, dict[str, int]]:
     """At most `max_candidates` candidates, and how many pairs each mask dropped.
 
     Approach points lie on the target, if there is one. While they yield fewer than half of `max_candidates`, as beside
     flat objects, four times as many are tried. Those of `_without_walls` are added where they are wanted.
+
+    Args:
+        cloud: where.
+        query: what is asked.
+        config: the limits.
+        edges: finds the cloud's outline, for who searches one cloud several times.
     """
     allowed = torch.arange(len(cloud), device=cloud.points.device)
     if cloud.on_target is not None:
@@ -143,7 +152,8 @@ def generate(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig) -
         if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
             break
         count = more_approach_points(count)
-    for made in _without_walls(cloud, query, config, approach_points, int(alive.sum())):
+    edges = edges or partial(outline, cloud, query)
+    for made in _without_walls(cloud, query, config, approach_points, int(alive.sum()), edges):
         others, also_alive, also_rejected = _judge(cloud, query, config, made)
         candidates, alive = candidates.joined_by(others), torch.cat([alive, also_alive])
         rejected = {name: count + also_rejected[name] for name, count in rejected.items()}
@@ -250,7 +260,12 @@ def clear_of_support(
 
 
 def _without_walls(
-    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, approach_points: Tensor, count: int
+    cloud: PreparedCloud,
+    query: GraspQuery,
+    config: CandidateConfig,
+    approach_points: Tensor,
+    count: int,
+    edges: Callable[[], Outline],
 ) -> Iterator[Candidates]:
     """The candidates that do without a wall to measure depth on, beside `count` of those that have one.
 
@@ -259,10 +274,10 @@ def _without_walls(
     those over a known plane whose walls are too low to measure a depth on.
     """
     if cloud.up is not None or count == 0:
-        edges = outline(cloud, query)
-        if len(edges.points):
+        outlines = edges()
+        if len(outlines.points):
             depths = (config.min_offset, config.max_depth)
-            yield _along_travel(cloud, query.gripper, config, approach_points, edges, depths)
+            yield _along_travel(cloud, query.gripper, config, approach_points, outlines, depths)
     if cloud.up is not None:
         low_faces = is_low(cloud) & (cloud.normals @ cloud.up >= _UPWARD)
         low = approach_points[low_faces[approach_points]]
@@ -380,9 +395,11 @@ def pairs_in_reach(
 def _pairs_of_some(
     points: Tensor, normals: Tensor, approach_points: Tensor, config: CandidateConfig
 ) -> tuple[Tensor, Tensor]:
-    offsets = points[None] - points[approach_points][:, None]
-    along_normal = (offsets * normals[None]).sum(dim=2)
-    square = offsets.square().sum(dim=2)
+    distances = torch.cdist(points[approach_points], points, compute_mode="donot_use_mm_for_euclid_dist")
+    which, contact = (distances <= config.max_pair_distance + _ROUNDING).nonzero(as_tuple=True)
+    offsets = points[contact] - points[approach_points[which]]
+    along_normal = (offsets * normals[contact]).sum(dim=1)
+    square = offsets.square().sum(dim=1)
     depth = (square - along_normal.square()).clamp(min=0).sqrt()
     ok = (
         (square <= config.max_pair_distance**2)
@@ -391,8 +408,7 @@ def _pairs_of_some(
         & (along_normal >= config.min_offset)
         & (along_normal <= config.max_offset)
     )
-    which, contact = ok.nonzero(as_tuple=True)
-    return approach_points[which], contact
+    return approach_points[which[ok]], contact[ok]
 
 
 def grasp_poses(

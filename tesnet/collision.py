@@ -6,8 +6,6 @@ metres; everything in the cloud's canonical frame.
 
 from __future__ import annotations
 
-import itertools
-import math
 from collections.abc import Callable
 from typing import Literal
 
@@ -19,7 +17,7 @@ from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper, Part
 from tesnet.obstacles import Obstacles
 from tesnet.points import points_in_grasp_frames
-from tesnet.swept import inside_hand, reach_of
+from tesnet.swept import inside_hand
 from tesnet.visibility import hidden
 
 APPROACH_DISTANCE = 0.05
@@ -36,7 +34,8 @@ HELD_POINTS = 10
 """Of a hand that a robot would drive into things: so many posted points lie so deep in it."""
 
 _BLOCK = 4_000_000
-_COARSE_STRIDE = 6
+_COARSE_STRIDES = (36, 6)
+"""Most collisions show with every so many points."""
 
 
 def blocked(
@@ -80,25 +79,26 @@ def _meets(
     return met
 
 
-def holds(posted: Tensor, candidates: Candidates, gripper: Gripper) -> Tensor:
+def holds(posted: Obstacles, candidates: Candidates, gripper: Gripper) -> Tensor:
     """Mask (C,): posted points lie well inside the open hand at the grasp, `HELD_POINTS` or more `HELD_DEPTH` deep.
 
     The last word on grasps that are to be returned: `blocked` looks at cells, and leaves out points that stand alone.
 
     Args:
-        posted: (N, 3) every point of the query, its support's included.
+        posted: every point of the query that is in reach of the hands, its support's included.
         candidates: C of them.
         gripper: the hand.
     """
-    if len(candidates) == 0:
-        return torch.zeros(0, dtype=torch.bool, device=posted.device)
-    low, high = reach_of(gripper, gripper.max_width, 0.0)
-    radius = max(math.hypot(*corner) for corner in itertools.product(*zip(low, high, strict=True)))
-    poses = candidates.Ts_canonical_grasp
-    origins = poses[:, :3, 3]
-    near = ((posted >= origins.amin(dim=0) - radius) & (posted <= origins.amax(dim=0) + radius)).all(dim=1)
-    held = Obstacles.of(posted[near]).count_in_hands(poses, gripper, candidates.widths, depth=HELD_DEPTH)
-    return held >= HELD_POINTS
+    poses, widths = candidates.Ts_canonical_grasp, candidates.widths
+    return posted.count_in_hands(poses, gripper, widths, depth=HELD_DEPTH) >= HELD_POINTS
+
+
+def in_reach(posted: Tensor, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Obstacles:
+    """Those of the posted points (N, 3) that hands at the grasps (C, 4, 4), one at least, may hold."""
+    corners = torch.tensor(gripper.corners(gripper.max_width), dtype=posted.dtype, device=posted.device)
+    places = corners @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
+    near = ((posted >= places.amin(dim=(0, 1))) & (posted <= places.amax(dim=(0, 1)))).all(dim=1)
+    return Obstacles.of(posted[near])
 
 
 def in_collision(
@@ -121,12 +121,17 @@ def in_collision(
     """
     hit = torch.zeros(len(Ts_canonical_grasp), dtype=torch.bool, device=points.device)
     widths = torch.as_tensor(widths, dtype=points.dtype, device=points.device).expand(len(hit))
-    # Most collisions show with a few points already; the others are looked for with all of them.
-    for some in (points[::_COARSE_STRIDE], points):
+    for some in (points[::stride] for stride in _COARSE_STRIDES):
         open_rows = (~hit).nonzero()[:, 0]
         for rows in open_rows.split(max(1, _BLOCK // max(1, len(some)))):
             between()
             hit[rows] = _hit(some, Ts_canonical_grasp[rows], gripper, widths[rows, None], approach_distance)
+    left = (~hit).nonzero()[:, 0]
+    obstacles = Obstacles.of(points)
+    found = obstacles.count_in_hands(
+        Ts_canonical_grasp[left], gripper, widths[left], distance=approach_distance, between=between
+    )
+    hit[left] = found > 0
     return hit
 
 

@@ -124,9 +124,9 @@ def spans(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> Span:
 def _between_fingers(cloud: PreparedCloud, poses: Tensor, near: Tensor, hand: Gripper) -> tuple[Tensor, Tensor, Tensor]:
     """Candidates (K,), places y (K,) and components of normals along y (K,) of the points between the open fingers."""
     half = hand.finger_breadth / 2 + _BESIDE
-    low, high = (-half, -hand.max_width, hand.palm_front), (half, hand.max_width, hand.tip_offset)
+    between = ((0.0, 0.0, hand.palm_front), (half, hand.max_width, hand.tip_offset))
     found = []
-    for rows, index, (x, y, z) in Obstacles.of(cloud.points).near(poses, low, high):
+    for rows, index, (x, y, z) in Obstacles.of(cloud.points).near(poses, [between]):
         inside = (x.abs() <= half) & (z >= hand.palm_front) & (z <= hand.tip_offset)
         inside &= (y <= near[rows] + _BIN) & (y >= near[rows] - hand.max_width)
         row = rows[inside]

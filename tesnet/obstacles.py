@@ -12,11 +12,11 @@ import torch
 from torch import Tensor
 
 from tesnet.geometry import Gripper
-from tesnet.points import members_of_cells
-from tesnet.swept import inside_hand, reach_of
+from tesnet.points import members_of_cells, points_in_grasp_frames
+from tesnet.swept import boxes_of, inside_hand
 
-BLOCK_SIZE = 0.04
-"""Edge of a block: several lie within a hand, and one holds some dozen cells of a surface."""
+BLOCK_SIZE = 0.025
+"""Edge of a block: many lie within a hand, and one holds some dozen cells of a surface."""
 
 _POSES_AT_ONCE = 512
 _PAIRS_AT_ONCE = 1_000_000
@@ -85,23 +85,22 @@ class Obstacles:
         if len(poses) == 0:
             return found
         widths = torch.as_tensor(widths, dtype=poses.dtype, device=poses.device).expand(len(poses))
-        for row, _, local in self.near(poses, *reach_of(gripper, float(widths.max()), distance), between):
+        boxes = boxes_of(gripper, float(widths.min()), float(widths.max()), distance)
+        for row, _, local in self.near(poses, boxes, between):
             found.index_add_(0, row, inside_hand(*local, gripper, widths[row], distance, depth).long())
         return found
 
     def near(
         self,
         poses: Tensor,
-        low: Sequence[float],
-        high: Sequence[float],
+        boxes: Sequence[tuple[Sequence[float], Sequence[float]]],
         between: Callable[[], None] = lambda: None,
     ) -> Iterator[tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]]:
         """The points of the blocks that a box in the frame of each pose touches, many poses at a time.
 
         Args:
             poses: (C, 4, 4).
-            low: the box's least corner in the frame of a pose.
-            high: its greatest.
+            boxes: their least and greatest |x|, |y| and z in the frame of a pose.
             between: called between blocks of work of some milliseconds.
 
         Yields:
@@ -110,10 +109,9 @@ class Obstacles:
         """
         if len(self) == 0:
             return
-        ends = torch.tensor([low, high], dtype=poses.dtype, device=poses.device)
         for first in range(0, len(poses), _POSES_AT_ONCE):
             some = poses[first : first + _POSES_AT_ONCE]
-            row, block = self._touching(some, *ends)
+            row, block = self._touching(some, boxes)
             between()
             total = self.count[block].cumsum(0)
             begin = 0
@@ -125,13 +123,17 @@ class Obstacles:
                 begin = stop
                 between()
 
-    def _touching(self, poses: Tensor, low: Tensor, high: Tensor) -> tuple[Tensor, Tensor]:
-        """Pairs, (K,) and (K,), of poses and blocks whose sphere meets the box from `low` to `high` about the pose."""
-        rotations, origins = poses[:, :3, :3], poses[:, :3, 3]
-        local = self.centres @ rotations - (origins[:, None] @ rotations)  # (C, B, 3)
-        outside = torch.maximum(low - local, local - high).clamp_(min=0)
-        row, block = (outside.square_().sum(dim=2) <= self.radii.square()).nonzero(as_tuple=True)
-        return row, block
+    def _touching(self, poses: Tensor, boxes: Sequence[tuple[Sequence[float], Sequence[float]]]) -> tuple[Tensor, ...]:
+        """Pairs, (K,) and (K,), of poses and blocks whose sphere meets a box (of |x|, |y|, z) at the pose."""
+        x, y, z = points_in_grasp_frames(self.centres, poses)
+        places = (x.abs_(), y.abs_(), z)
+        touching = torch.zeros_like(x, dtype=torch.bool)
+        for low, high in boxes:
+            outside = torch.zeros_like(x)
+            for place, least, most in zip(places, low, high, strict=True):
+                outside += (place - place.clamp(least, most)).square_()
+            touching |= outside <= self.radii.square()
+        return touching.nonzero(as_tuple=True)
 
     def _pairs(self, row: Tensor, block: Tensor) -> tuple[Tensor, Tensor]:
         """The rows (K,) of all points (K,) of the blocks, row by row."""

@@ -12,8 +12,9 @@ _FEW_POINTS = 700
 """Up to so many points are compared with each other, all with all."""
 
 _SLAB_QUERIES = 192
-_SLAB_MARGIN = 0.02
-"""Of more points, so many queries at a time are compared with the points that lie at most so far from them along x."""
+_SLAB_MARGIN = 0.015
+"""Of more points, so many queries at a time are compared with the points that lie at most so far from them along the
+longest axis."""
 
 _LARGEST_TABLE = 4_000_000
 """Distances that are in memory at a time, at most."""
@@ -52,23 +53,25 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
     Queries default to the points themselves; each is then its own first neighbour. With fewer than k points the last
     one is repeated.
 
-    Points and queries are sorted along x, and a block of queries is compared with the slab of points around it only;
-    the few queries whose k-th neighbour may lie outside the slab, and all queries of few points, are compared with all.
+    Points and queries are sorted along the points' longest axis, and a block of queries is compared with the slab of
+    points around it only; the few queries whose k-th neighbour may lie outside the slab, and all queries of few points,
+    are compared with all.
     """
     sources = points if queries is None else queries
     available = min(k, len(points))
     # Squared distances come from an expanded square, whose terms cancel: float64.
     exact, wanted = points.double(), sources.double()
-    by_x, order = exact[:, 0].sort()
+    longest = int((points.amax(dim=0) - points.amin(dim=0)).argmax())
+    places, order = exact[:, longest].sort()
     sorted_points = exact[order]
-    query_order = wanted[:, 0].argsort()
+    query_order = wanted[:, longest].argsort()
     neighbours = torch.empty(len(sources), available, dtype=torch.long, device=points.device)
     few = len(points) <= _FEW_POINTS
     unsure = [query_order] if few else []
     for rows in () if few else query_order.split(_SLAB_QUERIES):
         block = wanted[rows]
-        ends = torch.stack([block[0, 0] - _SLAB_MARGIN, block[-1, 0] + _SLAB_MARGIN])
-        first, last = torch.searchsorted(by_x, ends).tolist()
+        ends = torch.stack([block[0, longest] - _SLAB_MARGIN, block[-1, longest] + _SLAB_MARGIN])
+        first, last = torch.searchsorted(places, ends).tolist()
         if last - first < available:
             unsure.append(rows)
             continue

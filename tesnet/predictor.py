@@ -2,9 +2,11 @@
 
 from __future__ import annotations
 
+import itertools
 import time
 from collections.abc import Callable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
+from functools import cache, partial
 from pathlib import Path
 from typing import Any, TypeAlias
 
@@ -15,6 +17,7 @@ from tesnet import calibration, candidates, cloud, collision, networks, plausibi
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box, GraspSet, Pose
 from tesnet.networks import Network
+from tesnet.outline import Outline, outline
 from tesnet.points import nearest_neighbours
 from tesnet.query import MAX_SEED, NO_VIEWPOINT, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
@@ -30,6 +33,9 @@ FURTHER_SEARCHES = 4
 
 MOST_SCORED = 10_000
 """Candidates in all further searches together: who asks for many at once has had them."""
+
+_RANKINGS = 4
+"""At most so often grasps are ranked, less those that turn out to hold posted points."""
 
 _SEED_STEP = 0x9E3779B97F4A7C15
 """Between the seeds of one query's searches: queries whose seeds follow each other share none."""
@@ -192,7 +198,8 @@ class GraspPredictor:
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
         notes += _target_warnings(prepared, query, self._preparation)
 
-        found = self._search(prepared, query, clock)
+        edges = cache(partial(outline, prepared, query))
+        found = self._search(prepared, query, edges, clock)
         self._synchronise()
         clock.lap("candidates")
         if len(found.free) == 0:
@@ -200,11 +207,13 @@ class GraspPredictor:
             sizes = (len(prepared), found.count, 0)
             notes += _answer_warnings(0.0, prepared, query)
             return _nothing(query, reason, sizes, rejected | found.rejected, notes, clock)
-        return _Proposal(query, prepared, found, notes, clock)
+        return _Proposal(query, prepared, edges, found, notes, clock)
 
-    def _search(self, prepared: cloud.PreparedCloud, query: GraspQuery, clock: _Clock) -> _Found:
+    def _search(
+        self, prepared: cloud.PreparedCloud, query: GraspQuery, edges: Callable[[], Outline], clock: _Clock
+    ) -> _Found:
         clock.check()
-        found, rejected = candidates.generate(prepared, query, self._candidates)
+        found, rejected = candidates.generate(prepared, query, self._candidates, edges)
         clock.check()
         blocked = collision.blocked(prepared, found, query.gripper, query.unseen, clock.check)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
@@ -229,13 +238,9 @@ class GraspPredictor:
         clock.start()
         clock.check()
         found, scores = self._best_search(proposal, features)
-        ranked = _ranked(found, scores, query)
         posted = torch.from_numpy(query.points.copy()).to(self.device)
         posted = cloud.in_canonical_frame(posted, prepared.T_cloud_canonical)
-        if bool(collision.holds(posted, found.free.select(ranked.indices), query.gripper).any()):
-            clear = ~collision.holds(posted, found.free, query.gripper)
-            found, scores = found.only(clear), scores[clear]
-            ranked = _ranked(found, scores, query)
+        found, scores, ranked = _ranked_clear(posted, found, scores, query)
         last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
         rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
         grasps = _grasps(query, prepared, found.free, scores, ranked.indices)
@@ -261,7 +266,7 @@ class GraspPredictor:
             enough = number * query.max_candidates > MOST_SCORED
             if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates or enough:
                 break
-            other = self._search(prepared, _further(query, number), clock)
+            other = self._search(prepared, _further(query, number), proposal.edges, clock)
             self._synchronise()
             clock.lap("candidates")
             if len(other.free):
@@ -344,6 +349,7 @@ class _Proposal:
     Args:
         query: what is asked.
         prepared: its cloud.
+        edges: finds its outline, once.
         found: at least one candidate without collision.
         notes: warnings for the answer.
         clock: the time of its stages.
@@ -351,6 +357,7 @@ class _Proposal:
 
     query: GraspQuery
     prepared: cloud.PreparedCloud
+    edges: Callable[[], Outline]
     found: _Found
     notes: list[str]
     clock: _Clock
@@ -368,6 +375,26 @@ def _ranked(found: _Found, scores: torch.Tensor, query: GraspQuery) -> ranking.R
     )
 
 
+def _ranked_clear(
+    posted: torch.Tensor, found: _Found, scores: torch.Tensor, query: GraspQuery
+) -> tuple[_Found, torch.Tensor, ranking.Ranking]:
+    """The ranking of grasps that hold none of the posted points (N, 3), and the search and scores that are left.
+
+    Grasps are held against the points as they come to be ranked; from the `_RANKINGS`th time on, all of them.
+    """
+    obstacles = collision.in_reach(posted, found.free.Ts_canonical_grasp, query.gripper)
+    for number in itertools.count(1):
+        ranked = _ranked(found, scores, query)
+        asked = (ranked.indices if number < _RANKINGS else torch.arange(len(scores))).to(scores.device)
+        held = collision.holds(obstacles, found.free.select(asked), query.gripper)
+        if not bool(held.any()):
+            break
+        clear = torch.ones(len(scores), dtype=torch.bool, device=scores.device)
+        clear[asked[held]] = False
+        found, scores = found.only(clear), scores[clear]
+    return found, scores, ranked
+
+
 def _why_nothing(found: _Found) -> Reason:
     """Why a search whose candidates have been scored yields no grasp."""
     return "below_min_score" if len(found.free) else "all_in_collision"
@@ -376,7 +403,7 @@ def _why_nothing(found: _Found) -> Reason:
 def _further(query: GraspQuery, number: int) -> GraspQuery:
     """The query, for its further search of this number."""
     count = candidates.more_approach_points(query.num_approach_points)
-    return replace(query, num_approach_points=count, seed=(query.seed + number * _SEED_STEP) % (MAX_SEED + 1))
+    return query.but(num_approach_points=count, seed=(query.seed + number * _SEED_STEP) % (MAX_SEED + 1))
 
 
 def configuration_of(network: Network) -> dict[str, dict[str, Any]]:

@@ -6,6 +6,7 @@ What the service sees to by itself, such as `frame_convention`, is no part of it
 from __future__ import annotations
 
 import math
+from copy import copy
 from dataclasses import dataclass
 from typing import Any, Literal, TypeAlias
 
@@ -109,6 +110,19 @@ class GraspQuery:
         return sum(array.nbytes for array in arrays if isinstance(array, np.ndarray))
 
     def __post_init__(self) -> None:
+        self._check_options()
+        self._take_points()
+        self._take_what_belongs_to_points()
+
+    def but(self, **options: Any) -> GraspQuery:
+        """This query with other options, which are checked; its points, which have been, are shared."""
+        other = copy(self)
+        for name, value in options.items():
+            object.__setattr__(other, name, value)
+        other._check_options()  # noqa: SLF001
+        return other
+
+    def _check_options(self) -> None:
         if self.viewpoints is not None:
             object.__setattr__(self, "viewpoints", _viewpoints(self.viewpoints))
         if isinstance(self.up, str):
@@ -128,8 +142,6 @@ class GraspQuery:
             value = getattr(self, name)
             if value is not None and not isinstance(value, kind):
                 raise InvalidQuery(name, f"is of type {type(value).__name__}; give a {kind.__name__} or None")
-        self._take_points()
-        self._take_what_belongs_to_points()
         _check_gripper(self.gripper)
         _whole_in_range("max_grasps", self.max_grasps, 1, MAX_GRASPS)
         _in_range("min_score", self.min_score, 0, 1)

@@ -6,7 +6,7 @@ Knows no candidate and no network. numpy only; lengths in metres.
 from __future__ import annotations
 
 from collections.abc import Iterable
-from dataclasses import dataclass, replace
+from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
@@ -68,9 +68,9 @@ def settled(query: GraspQuery) -> tuple[GraspQuery, SupportPlane | None, list[st
         return query, None, []
     plane = find(query)
     if plane is None:
-        return replace(query, up=query.known_up, support_height=None), None, [_NO_UP if finds_up else _NO_HEIGHT]
+        return query.but(up=query.known_up, support_height=None), None, [_NO_UP if finds_up else _NO_HEIGHT]
     note = _up_note(plane, query) if finds_up else f"support_height auto: {_figures(plane, query)}"
-    return replace(query, up=plane.up, support_height=plane.height), plane, [note]
+    return query.but(up=plane.up, support_height=plane.height), plane, [note]
 
 
 _NO_UP = "up auto: no plane that things stand on was found, so none is kept clear and up is unknown: give up"

@@ -40,6 +40,22 @@ def reach_of(gripper: Gripper, width: float, distance: float) -> tuple[list[floa
     return [*low[:2].tolist(), float(low[2]) - distance], high.tolist()
 
 
+def boxes_of(
+    gripper: Gripper, narrowest: float, widest: float, distance: float
+) -> list[tuple[list[float], list[float]]]:
+    """The least and largest |x|, |y| and z of each part all along its way, at all openings between two.
+
+    One finger stands for both.
+    """
+    boxes = []
+    for part in gripper.parts:
+        if part.side >= 0:
+            inner = max(part.span(part.thickness.full, narrowest)[0], 0.0)
+            outer = part.span(part.thickness.full, widest)[1]
+            boxes.append(([0.0, inner, part.back - distance], [part.breadth.full / 2, outer, part.front]))
+    return boxes
+
+
 def _inside_part(
     part: Part, x: Tensor, y: Tensor, z: Tensor, width: Tensor | float, distance: float, depth: float
 ) -> Tensor:

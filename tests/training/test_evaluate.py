@@ -9,6 +9,7 @@ import pytest
 import torch
 
 from tesnet import networks, weights
+from tesnet.hands import HANDS
 from tesnet.predictor import configuration_of
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view, write
@@ -106,7 +107,12 @@ def test_served_scores_are_judged_by_hand_sensor_and_opening() -> None:
     free = torch.arange(60) < 50
     views = [
         replace(labelled_view(0), collision_free=free),
-        replace(labelled_view(1), gripper="rg2", sensor="d435", widths=torch.full((60,), 0.104)),
+        replace(
+            labelled_view(1),
+            gripper=(rg2 := HANDS["rg2"].gripper),
+            widths=torch.full((60,), rg2.max_width),
+            sensor="d435",
+        ),
         replace(labelled_view(2), sensor="d435", collision_free=torch.zeros(60, dtype=torch.bool)),
     ]
     network, calibration = fresh_network(), (2.0, -0.3)
