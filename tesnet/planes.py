@@ -46,6 +46,8 @@ SQUARE = 0.04
 """Edge of the squares of a footprint. A gap of one square, as behind things, does not part it."""
 SIDES = 24
 """Of an outline."""
+_TURNS = 90
+"""Of a rectangle that are tried, over a right angle."""
 _GOLDEN = (np.sqrt(5) - 1) / 2
 
 
@@ -277,10 +279,21 @@ def radius(points: Array, up: Array) -> float:
 
 
 def outline(points: Array, up: Array) -> Array:
-    """(SIDES, 4): the narrowest prism along `up`, of so many evenly turned sides, that holds the points."""
-    angle = 2 * np.pi * np.arange(SIDES) / SIDES
-    normals = np.stack([np.cos(angle), np.sin(angle)], axis=1) @ basis(up)[:, :2].T
-    return np.column_stack([normals, (points @ normals.T).max(axis=0)])
+    """(SIDES, 4): the narrowest prism along `up`, of so many evenly turned sides, that holds the points.
+
+    One of its sides lies along the smallest rectangle about the points, as most tables, boards and bins are rectangles.
+    """
+    level = points @ basis(up)[:, :2]
+    quarter = np.pi / 2 * np.arange(_TURNS) / _TURNS
+    widths = [np.ptp(level @ _directions(quarter + turn).T, axis=0) for turn in (0.0, np.pi / 2)]
+    angle = quarter[(widths[0] * widths[1]).argmin()] + 2 * np.pi * np.arange(SIDES) / SIDES
+    directions = _directions(angle)
+    return np.column_stack([directions @ basis(up)[:, :2].T, (level @ directions.T).max(axis=0)])
+
+
+def _directions(angle: Array) -> Array:
+    """Unit directions (A, 2) at angles (A,)."""
+    return np.stack([np.cos(angle), np.sin(angle)], axis=1)
 
 
 def within(points: NDArray[np.floating], sides: Array) -> Mask:

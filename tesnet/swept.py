@@ -33,13 +33,6 @@ def inside_hand(
     return inside
 
 
-def reach_of(gripper: Gripper, width: float, distance: float) -> tuple[list[float], list[float]]:
-    """The corners of a box in the grasp frame that holds the hand all along its way."""
-    corners = gripper.corners(width)
-    low, high = corners.min(axis=0), corners.max(axis=0)
-    return [*low[:2].tolist(), float(low[2]) - distance], high.tolist()
-
-
 def boxes_of(
     gripper: Gripper, narrowest: float, widest: float, distance: float
 ) -> list[tuple[list[float], list[float]]]:

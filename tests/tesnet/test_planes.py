@@ -68,6 +68,19 @@ def test_the_outline_holds_the_points_and_little_else() -> None:
     ].any()
 
 
+@pytest.mark.parametrize("turn_deg", [3.0, 11.0, 38.0, 71.0])
+def test_the_outline_of_a_board_ends_where_the_board_does_however_it_lies(turn_deg: float) -> None:
+    """A wall 1 cm behind a board, of which twenty-four sides of any turn left 2 cm to the board."""
+    cosine, sine = np.cos(np.deg2rad(turn_deg)), np.sin(np.deg2rad(turn_deg))
+    turn = np.array([[cosine, -sine, 0.0], [sine, cosine, 0.0], [0.0, 0.0, 1.0]])
+    board = square(1.0) * np.array([0.9, 0.34, 1.0]) @ turn.T
+    sides = planes.outline(board, np.array([0.0, 0.0, 1.0]))
+    along = np.linspace(-0.44, 0.44, 89)
+    for beyond in (-0.18, 0.18):
+        wall = np.column_stack([along, np.full(89, beyond), np.zeros(89)]) @ turn.T
+        assert not planes.within(wall, sides).any()
+
+
 def test_the_spread_of_a_sample_is_even() -> None:
     rows = planes.spread(np.arange(300_000.0)[:, None], 1000)[:, 0]
     assert len(rows) == 1000

@@ -4,19 +4,24 @@ import numpy as np
 import torch
 
 from tesnet.geometry import PANDA, Gripper
-from tesnet.swept import inside_hand, reach_of
+from tesnet.swept import boxes_of, inside_hand
 
 BROAD = Gripper(max_width=0.06, palm_breadth=0.12, palm_front_breadth=0.08, palm_length=0.25)
 
 
-def test_nothing_of_the_hand_lies_outside_its_reach() -> None:
-    x, y, z = places = torch.from_numpy(np.random.default_rng(0).uniform(-0.3, 0.3, (3, 200_000)))
+def test_all_of_the_hand_lies_in_the_boxes_of_its_parts_and_fills_them() -> None:
+    x, y, z = torch.from_numpy(np.random.default_rng(0).uniform(-0.3, 0.3, (3, 400_000)))
     for hand in (PANDA, BROAD):
-        low, high = reach_of(hand, hand.max_width, 0.05)
         inside = inside_hand(x, y, z, hand, hand.max_width, 0.05)
-        assert inside.any()
-        within = ((torch.tensor(low) <= places.T) & (torch.tensor(high) >= places.T)).all(dim=1)
-        assert bool(within[inside].all())
+        found = torch.stack([x.abs(), y.abs(), z], dim=1)[inside]
+        boxes = boxes_of(hand, hand.max_width, hand.max_width, 0.05)
+        in_box = torch.stack(
+            [((found >= torch.tensor(box[0])) & (found <= torch.tensor(box[1]))).all(1) for box in boxes]
+        )
+        assert bool(in_box.any(dim=0).all())
+        for mask, (low, high) in zip(in_box, boxes, strict=True):
+            torch.testing.assert_close(found[mask].amin(dim=0), torch.tensor(low).double(), atol=0.004, rtol=0)
+            torch.testing.assert_close(found[mask].amax(dim=0), torch.tensor(high).double(), atol=0.004, rtol=0)
 
 
 def test_a_way_of_no_length_is_the_hand_at_rest() -> None:
