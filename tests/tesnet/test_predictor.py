@@ -308,8 +308,8 @@ def test_other_candidates_are_searched_for_while_the_best_score_is_low(monkeypat
     searches = []
     search = predictor._search
 
-    def note(prepared: cloud.PreparedCloud, asked: GraspQuery, clock: Any) -> Any:
-        found = search(prepared, asked, clock)
+    def note(prepared: cloud.PreparedCloud, asked: GraspQuery, *others: Any) -> Any:
+        found = search(prepared, asked, *others)
         searches.append((asked.num_approach_points, asked.seed, found.count))
         return found
 
