@@ -1,4 +1,7 @@
-"""Speed of the predictor alone, stage by stage: `python -m bench.predict --threads 2`."""
+"""Speed of the predictor alone, stage by stage: `python -m bench.predict --threads 2`.
+
+With `--neighbours N` also beside as many busy processes, and how many times longer that takes.
+"""
 
 from __future__ import annotations
 
@@ -10,6 +13,7 @@ from pathlib import Path
 import numpy as np
 import torch
 
+from bench.neighbours import neighbours
 from bench.scene import SUPPORT_HEIGHT, UP, WORKSPACE_MAXIMUM, WORKSPACE_MINIMUM, Scene, five_objects
 from bench.table import processor, table
 from tesnet.geometry import Box
@@ -61,6 +65,7 @@ def main() -> None:
     parser.add_argument("--candidates", type=int, default=1_500, help="most candidates")
     parser.add_argument("--approach-points", type=int, default=32, help="approach points")
     parser.add_argument("--batch", type=int, default=1, help="clouds predicted together; times are a cloud's share")
+    parser.add_argument("--neighbours", type=int, default=0, help="busy processes to measure beside as well")
     parser.add_argument("--weights", type=Path, help="weights file instead of the one that is installed")
     arguments = parser.parse_args()
 
@@ -77,6 +82,12 @@ def main() -> None:
         f"{counts.collision_free} free of collision, {counts.returned} returned; {arguments.runs} runs\n"
     )
     print(table(samples))
+    if arguments.neighbours:
+        with neighbours(arguments.neighbours):
+            _, beside = measure(predictor, asked, arguments.runs, arguments.batch)
+        print(f"\nbeside {arguments.neighbours} busy processes\n\n{table(beside)}\n")
+        times = np.percentile(beside["total"], [50, 95]) / np.percentile(samples["total"], [50, 95])
+        print(f"beside / alone: median {times[0]:.2f}, p95 {times[1]:.2f}")
 
 
 if __name__ == "__main__":

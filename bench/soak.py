@@ -93,10 +93,8 @@ def main() -> int:
     print(f"\nanswers {dict(total.statuses)}, {total.throughput:.2f}/s, p50/95/99 {percentiles(total.accepted_ms)} ms")
     print(f"hostile {dict(sorted(hostile.statuses.items()))}")
     growth = last / first - 1
-    print(
-        f"memory  {first:.1f} MB after the warm-up, {last:.1f} MB at the end: {100 * growth:+.2f} %; {highest:.0f} MB "
-        "at its highest"
-    )
+    print(f"memory  {first:.1f} MB after the warm-up, {last:.1f} MB at the end: {100 * growth:+.2f} %")
+    print(f"        {highest:.1f} MB at its highest")
     lost = sum(total.statuses.values()) - total.statuses[200]
     wrong = hostile.wrong + [f"{lost} honest requests got no grasps"] * bool(lost)
     wrong += [f"memory grew by more than {100 * MEMORY_WITHIN:g} %"] * (growth > MEMORY_WITHIN)

@@ -21,6 +21,7 @@ from tesnet.outline import Outline, outline
 from tesnet.points import nearest_neighbours
 from tesnet.query import MAX_SEED, NO_VIEWPOINT, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
+from tesnet.threads import Threads
 
 COARSEST_RESOLUTION = 0.0005
 """Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
@@ -72,6 +73,7 @@ class GraspPredictor:
         calibration: (a, b) of score = sigmoid(a * logit + b).
         model: what to tell about it.
         device: where everything is computed.
+        num_threads: CPU threads of the whole process while no other one keeps the cores busy; None for torch's number.
     """
 
     def __init__(
@@ -81,9 +83,11 @@ class GraspPredictor:
         calibration: tuple[float, float],
         model: ModelInfo,
         device: torch.device,
+        num_threads: int | None = None,
     ) -> None:
         self.model = model
         self.device = device
+        self._threads = Threads(num_threads)
         self._network = network
         self._calibration = calibration
         self._preparation = cloud.PreparationConfig(**configuration["preparation"])
@@ -96,20 +100,19 @@ class GraspPredictor:
         Args:
             path: a `.safetensors` file written by `python -m training fit`.
             device: `cpu`, `cuda`, `cuda:1` ... or `auto`: the GPU when there is one.
-            num_threads: CPU threads of the whole process; None leaves torch's number.
+            num_threads: CPU threads of the whole process, of which one alone computes while other processes keep the
+                cores busy (`tesnet.threads`); None for torch's number.
 
         Raises:
             WeightsError: the file is missing, corrupted or does not fit its network.
             DeviceError: this machine does not have the device.
         """
         chosen = _device(device)
-        if num_threads is not None:
-            torch.set_num_threads(num_threads)
         network, header = networks.load(path)
         try:
             sections = {name: dict(header.configuration[name]) for name in ("network", "preparation", "candidates")}
             model = ModelInfo(header.network, header.version, weights.sha256(path), header.training or {}, sections)
-            return cls(network.to(chosen), sections, header.calibration, model, chosen)
+            return cls(network.to(chosen), sections, header.calibration, model, chosen, num_threads)
         except (KeyError, TypeError, ValueError) as error:
             why = f"its configuration is not of this version ({error}); get matching weights"
             raise WeightsError(path, why) from error
@@ -125,11 +128,10 @@ class GraspPredictor:
         if not networks.is_weightless(name):
             raise ValueError(f"network {name!r} has weights; load them from a file")
         chosen = _device(device)
-        if num_threads is not None:
-            torch.set_num_threads(num_threads)
         network = networks.build(name).eval()
         sections = configuration_of(network)
-        return cls(network.to(chosen), sections, (1.0, 0.0), ModelInfo(name, "1", None, {}, sections), chosen)
+        model = ModelInfo(name, "1", None, {}, sections)
+        return cls(network.to(chosen), sections, (1.0, 0.0), model, chosen, num_threads)
 
     @property
     def preparation(self) -> cloud.PreparationConfig:
@@ -173,9 +175,17 @@ class GraspPredictor:
             GaveUp: as one of `give_up` asked.
         """
         patience = [None] * len(queries) if give_up is None else give_up
-        begun = [self._propose(*asked) for asked in zip(queries, patience, strict=True)]
-        features = iter(self._encode([item for item in begun if isinstance(item, _Proposal)]))
-        return [self._answer(item, next(features)) if isinstance(item, _Proposal) else item for item in begun]
+        begun = []
+        for asked in zip(queries, patience, strict=True):
+            with self._threads.working():
+                begun.append(self._propose(*asked))
+        with self._threads.working():
+            features = iter(self._encode([item for item in begun if isinstance(item, _Proposal)]))
+        answers = []
+        for item in begun:
+            with self._threads.working():
+                answers.append(self._answer(item, next(features)) if isinstance(item, _Proposal) else item)
+        return answers
 
     def _propose(self, query: GraspQuery, give_up: GiveUp | None) -> _Proposal | GraspResult:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""

@@ -367,7 +367,7 @@ def test_a_device_that_does_not_exist_is_refused(tmp_path: Path, device: str) ->
 
 
 def test_the_number_of_threads_is_set_on_request(tmp_path: Path) -> None:
-    """In a process of its own, since it is the whole process's number."""
+    """In a process of its own, since it is the whole process's number, which is set when a prediction begins."""
     network = fresh_network()
     weights.save(
         tmp_path / "a.safetensors",
@@ -375,8 +375,11 @@ def test_the_number_of_threads_is_set_on_request(tmp_path: Path) -> None:
         weights.Header("tesnet", "0", configuration_of(network)),
     )
     program = (
-        "import sys, torch; from pathlib import Path; from tesnet.predictor import GraspPredictor;"
-        "GraspPredictor.load(Path(sys.argv[1]), num_threads=3); print(torch.get_num_threads())"
+        "import sys, numpy, torch; from pathlib import Path; from tesnet.errors import GaveUp;"
+        "from tesnet.predictor import GraspPredictor; from tesnet.query import GraspQuery\n"
+        "predictor = GraspPredictor.load(Path(sys.argv[1]), num_threads=3)\n"
+        "try: predictor.predict(GraspQuery(numpy.zeros((1, 3))), lambda: print(torch.get_num_threads()) or True)\n"
+        "except GaveUp: pass"
     )
     done = subprocess.run(
         [sys.executable, "-c", program, str(tmp_path / "a.safetensors")], capture_output=True, text=True, check=True
