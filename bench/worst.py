@@ -1,7 +1,9 @@
 """The worst legal requests, in time and memory: `python -m bench.worst`.
 
 Each is predicted, or decoded, in a process of its own by one thread; its time is told as a multiple of what
-`bench.predict` takes for 20,000 points in the same sitting, its memory as what the process needed more than before.
+`bench.predict` takes for 20,000 points in the same sitting, its memory as what the process needed more than before, and
+as unseen the longest time in which a prediction did not look whether anybody waits for it. What is tried follows from
+the limits and from the types of `tesnet.query.GraspQuery`, so that a new option is tried as well.
 """
 
 from __future__ import annotations
@@ -14,9 +16,12 @@ import subprocess
 import sys
 import time
 from collections.abc import Callable, Mapping
-from dataclasses import replace
+from dataclasses import fields, replace
+from functools import partial
+from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
+from numpy.typing import NDArray
 
 from bench import predict
 from bench.scene import five_objects
@@ -25,40 +30,105 @@ from bench.table import processor
 from service.errors import ServiceError
 from service.payloads import decoder_for
 from service.settings import Settings
-from tesnet.errors import TesnetError
-from tesnet.geometry import Box
+from tesnet.errors import InvalidQuery, TesnetError
+from tesnet.geometry import WIDEST, Box, Gripper
+from tesnet.hands import HANDS
 from tesnet.predictor import GraspPredictor
-from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_VIEWPOINTS, GraspQuery
+from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS, GraspQuery
 from tesnet.weights import default_weights
 
 MOST_POINTS = Settings().max_points
 MOST_BYTES = Settings().max_body_bytes
+LONGEST_PART = 0.5
+"""Metres: of a hand."""
 RUNS = 11
 
+Array = NDArray[Any]
+EVERYTHING = "everything"
 
-def queries() -> Mapping[str, Callable[[], GraspQuery]]:
-    """The queries that take longest, by what is the most of each."""
+
+def clouds() -> Mapping[str, Callable[[], GraspQuery]]:
+    """The clouds that take longest, asked about with the most effort."""
     rng = np.random.default_rng(0)
-    base = predict.query(five_objects(20_000), MAX_CANDIDATES, MAX_APPROACH_POINTS)
-    views = rng.normal(0, 1, (MAX_VIEWPOINTS, 3)) + np.array([0, 0, 2])
+    small = predict.query(five_objects(20_000), MAX_CANDIDATES, MAX_APPROACH_POINTS)
+    bare = replace(small, workspace=None, support_height=None, up=None)
+
+    def of(points: Array) -> GraspQuery:
+        return replace(bare, points=points.astype(np.float32))
 
     def sheet() -> GraspQuery:
         """Along a side of the workspace, where the most places are taken for occupied."""
         points = np.column_stack([np.full(40_000, 0.0005), rng.uniform(0, 0.5, (40_000, 2))]).astype(np.float32)
         box = Box(np.zeros(3), np.array([0.5, 0.5, 0.5]))
-        return replace(base, points=points, workspace=box, support_height=None)
+        return replace(small, points=points, workspace=box, support_height=None)
 
-    def everywhere(width: float) -> GraspQuery:
-        points = rng.uniform(-width / 2, width / 2, (MOST_POINTS, 3)).astype(np.float32)
-        return replace(base, points=points, workspace=None, support_height=None, viewpoints=views, unseen="occupied")
+    def table() -> GraspQuery:
+        """Two metres wide, and what lies on it."""
+        top = np.column_stack([rng.uniform(-1, 1, (MOST_POINTS // 2, 2)), rng.normal(0, 0.001, MOST_POINTS // 2)])
+        things = rng.uniform([-0.5, -0.5, 0], [0.5, 0.5, 0.1], (MOST_POINTS - len(top), 3))
+        return of(np.concatenate([top, things]))
 
     return {
-        "20,000 points, most effort": lambda: base,
-        "the same, 64 viewpoints, occupied": lambda: replace(base, viewpoints=views, unseen="occupied"),
-        "a sheet along a side, most effort": sheet,
-        "most points in 0.3 m, all of it": lambda: everywhere(0.3),
-        "most points in 4 m, all of it": lambda: everywhere(4.0),
+        "20,000 points": lambda: small,
+        "a sheet along a side": sheet,
+        "most points, 0.3 m wide": lambda: of(rng.uniform(-0.15, 0.15, (MOST_POINTS, 3))),
+        "most points, 4 m wide": lambda: of(rng.uniform(-2, 2, (MOST_POINTS, 3))),
+        "most points, a table": table,
     }
+
+
+def options(query: GraspQuery) -> Mapping[str, Mapping[str, Any]]:
+    """Each option of a query at what should cost most: words, switches and known hands as its types name them."""
+    rng = np.random.default_rng(1)
+    count = len(query.points)
+    views = rng.normal(0, 1, (MAX_VIEWPOINTS, 3)) + np.array([0, 0, 2])
+    given: dict[str, Mapping[str, Any]] = {
+        f"{field.name} {word}": {field.name: word}
+        for field in fields(GraspQuery)
+        for word in _words(get_type_hints(GraspQuery)[field.name])
+        if word != field.default
+    }
+    given |= {f"gripper {name}": {"gripper": hand.gripper} for name, hand in HANDS.items()}
+    return given | {
+        "gripper, the largest": {"gripper": _largest_hand()},
+        "viewpoints": {"viewpoints": views},
+        "view_index": {"viewpoints": views, "view_index": np.arange(count) % MAX_VIEWPOINTS},
+        "normals": {"normals": rng.normal(0, 1, (count, 3))},
+        "target": {"target": rng.random(count) < 0.5},
+        "most grasps": {"max_grasps": MAX_GRASPS, "separation_translation": 0.0},
+    }
+
+
+def _words(kind: Any) -> tuple[Any, ...]:
+    """What an option of this type may be where that is a word or a switch."""
+    if kind is bool:
+        return (True, False)
+    if get_origin(kind) is Literal:
+        return get_args(kind)
+    return tuple(word for part in get_args(kind) for word in _words(part))
+
+
+def _largest_hand() -> Gripper:
+    sizes = {name: LONGEST_PART for name, size in Gripper().sizes().items() if size and name != "max_width"}
+    return Gripper(**sizes | {"max_width": WIDEST, "tip_offset": Gripper().tip_offset})
+
+
+def queries() -> Mapping[str, Callable[[], GraspQuery]]:
+    """Every option by itself on the smallest cloud, and every cloud with nothing and with everything."""
+    smallest = next(iter(clouds()))
+
+    def with_option(cloud: str, name: str) -> GraspQuery:
+        query = clouds()[cloud]()
+        if name != EVERYTHING:
+            return replace(query, **{"support_height": None} | options(query)[name])
+        for option in options(query).values():
+            with contextlib.suppress(InvalidQuery):  # beside another option
+                query = replace(query, **option)
+        return query
+
+    cases: dict[str, Callable[[], GraspQuery]] = dict(clouds())
+    cases |= {f"{smallest}, {name}": partial(with_option, smallest, name) for name in options(clouds()[smallest]())}
+    return cases | {f"{cloud}, {EVERYTHING}": partial(with_option, cloud, EVERYTHING) for cloud in clouds()}
 
 
 def bodies() -> Mapping[str, tuple[str, Callable[[], bytes]]]:
@@ -95,16 +165,27 @@ def measure(name: str) -> dict[str, float]:
         return {"seconds": time.perf_counter() - started, "mb": memory_mb(os.getpid(), "VmHWM") - before}
     predictor = GraspPredictor.load(default_weights(), num_threads=1)
     predictor.warm_up()
-    asked = queries()[name]()
-    before, started = memory_mb(os.getpid(), "VmHWM"), time.perf_counter()
-    predictor.predict(asked)
-    return {"seconds": time.perf_counter() - started, "mb": memory_mb(os.getpid(), "VmHWM") - before}
+    asked, looks = queries()[name](), [time.perf_counter()]
+
+    def give_up() -> bool:
+        looks.append(time.perf_counter())
+        return False
+
+    before, looks[0] = memory_mb(os.getpid(), "VmHWM"), time.perf_counter()
+    predictor.predict(asked, give_up)
+    looks.append(time.perf_counter())
+    return {
+        "seconds": looks[-1] - looks[0],
+        "mb": memory_mb(os.getpid(), "VmHWM") - before,
+        "unseen": float(np.diff(looks).max()),
+    }
 
 
 def main() -> None:
     """Measure and print."""
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--case", help="measure this one here and print JSON")
+    parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name holds this text")
     arguments = parser.parse_args()
     if arguments.case:
         print(json.dumps(measure(arguments.case)))
@@ -115,11 +196,15 @@ def main() -> None:
     _, samples = predict.measure(predictor, predict.query(five_objects(20_000), 1_500, 32), RUNS)
     usual = float(np.median(samples["total"])) / 1e3
     print(f"{processor()}, one thread; 20,000 points take a median of {1e3 * usual:.0f} ms ({RUNS} runs)\n")
-    print(f"{'':36} {'seconds':>8} {'times':>7} {'more MB':>8}")
+    print(f"{'':48} {'seconds':>8} {'times':>7} {'more MB':>8} {'unseen ms':>10}")
     for name in (*queries(), *bodies()):
+        if arguments.only not in name:
+            continue
         command = [sys.executable, "-m", "bench.worst", "--case", name]
-        found = json.loads(subprocess.run(command, capture_output=True, text=True, check=True).stdout)
-        print(f"{name:36} {found['seconds']:8.2f} {found['seconds'] / usual:7.1f} {found['mb']:8.0f}", flush=True)
+        found = json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
+        seconds = found["seconds"]
+        unseen = f"{1e3 * found['unseen']:10.0f}" if "unseen" in found else ""
+        print(f"{name:48} {seconds:8.2f} {seconds / usual:7.1f} {found['mb']:8.0f} {unseen}", flush=True)
 
 
 if __name__ == "__main__":

@@ -6,6 +6,7 @@ cloud's canonical frame, which moves with the cloud; grid and order of the point
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import numpy as np
@@ -128,7 +129,11 @@ class PreparedCloud:
 
 
 def prepare(
-    query: GraspQuery, config: PreparationConfig, device: torch.device, support: SupportPlane | None = None
+    query: GraspQuery,
+    config: PreparationConfig,
+    device: torch.device,
+    support: SupportPlane | None = None,
+    between: Callable[[], None] = lambda: None,
 ) -> PreparedCloud | None:
     """The prepared cloud of a query, or None when no point lies in the workspace above the support plane.
 
@@ -140,6 +145,7 @@ def prepare(
         device: where.
         support: the one that was found. Its measured noise is dropped with it; where the query has no target, grasps
             are looked for on what stands on it, the rest counts for collision.
+        between: called between blocks of work of some tens of milliseconds.
     """
     noise = SUPPORT_NOISE if support is None else max(SUPPORT_NOISE, support.clearance)
     posted, support_sd = _columns(query).to(device), 0.0
@@ -155,6 +161,7 @@ def prepare(
     table = posted[sought]
     if len(table) == 0:
         return None
+    between()
     near = (table[:, :3] - table[:, :3].median(dim=0).values).norm(dim=1) <= config.max_extent
     dropped_far = int((~near).sum())
     table = table[near] if dropped_far else table
@@ -162,13 +169,16 @@ def prepare(
 
     viewpoints = torch.zeros(1, 3) if query.viewpoints is None else torch.tensor(query.viewpoints)
     up = None if query.known_up is None else torch.tensor(query.known_up)
+    between()
     T_cloud_canonical = canonical_frame(points, viewpoints.to(device), None if up is None else up.to(device))
+    between()
 
     def to_canonical(positions: Tensor) -> Tensor:
         return in_canonical_frame(positions, T_cloud_canonical)
 
     table = _quieter(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config, support_sd)
     table = voxel_downsample(table, config.voxel_size)
+    between()
     a_cell = len(points) / len(table)
     viewpoints = to_canonical(viewpoints).to(device)
     on_target = _on_target(query, table, T_cloud_canonical)
@@ -181,14 +191,19 @@ def prepare(
     outward = None if _outward(query) is None else table[:, -3:] @ torch.tensor(T_cloud_canonical.rotation).to(table)
     points = table[:, :3].contiguous()
 
-    neighbours = nearest_neighbours(points, max(config.normal_neighbours, config.outlier_neighbours + 1))
+    between()
+
+    neighbours = nearest_neighbours(
+        points, max(config.normal_neighbours, config.outlier_neighbours + 1), between=between
+    )
     keep = ~statistical_outliers(points, neighbours[:, : config.outlier_neighbours + 1], config.outlier_std_ratio)
-    points, neighbours = drop_points(points, neighbours, keep)
+    points, neighbours = drop_points(points, neighbours, keep, between)
     on_target = None if on_target is None else on_target[keep]
     outward = None if outward is None else outward[keep]
     normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
     graph = neighbours[:, : config.graph_neighbours]
-    normals, view_directions = orient(points, normals, graph, viewpoints, outward)
+    between()
+    normals, view_directions = orient(points, normals, graph, viewpoints, outward, between)
     support_height = None
     if query.known_up is not None and isinstance(query.support_height, float):
         support_height = float(query.support_height - T_cloud_canonical.translation @ query.known_up)

@@ -5,6 +5,8 @@ Knows bare points and no query. Vectorised torch on the device of its inputs; le
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -19,7 +21,12 @@ _IN_FRONT = 0.0015
 
 
 def orient(
-    points: Tensor, normals: Tensor, neighbours: Tensor, viewpoints: Tensor, outward: Tensor | None = None
+    points: Tensor,
+    normals: Tensor,
+    neighbours: Tensor,
+    viewpoints: Tensor,
+    outward: Tensor | None = None,
+    between: Callable[[], None] = lambda: None,
 ) -> tuple[Tensor, Tensor]:
     """Normals (P, 3) turned outward, and unit directions (P, 3) to the viewpoint that saw each point.
 
@@ -30,15 +37,22 @@ def orient(
         viewpoints: (V, 3).
         outward: (P, 3) directions out of the surface where they are known, zeros elsewhere: given normals, or
             directions to the viewpoint that is known to have seen a point. There they decide.
+        between: called between the viewpoints.
     """
     if len(viewpoints) > 1:
-        seen_by = towards_who_saw(points, normals, neighbours, viewpoints)
+        seen_by = towards_who_saw(points, normals, neighbours, viewpoints, between)
         told = torch.zeros_like(points) if outward is None else outward
         outward = torch.where(told.norm(dim=1, keepdim=True) > LEAST_OUTWARD, told, seen_by)
     return orient_normals(points, normals, viewpoints, outward)
 
 
-def towards_who_saw(points: Tensor, normals: Tensor, neighbours: Tensor, viewpoints: Tensor) -> Tensor:
+def towards_who_saw(
+    points: Tensor,
+    normals: Tensor,
+    neighbours: Tensor,
+    viewpoints: Tensor,
+    between: Callable[[], None] = lambda: None,
+) -> Tensor:
     """Unit directions (P, 3) from each point to the viewpoint that saw it.
 
     A viewpoint cannot have seen a point from whose surface others stand out in its line of sight. What hides a point
@@ -51,11 +65,16 @@ def towards_who_saw(points: Tensor, normals: Tensor, neighbours: Tensor, viewpoi
         normals: (P, 3) unit, of either sign.
         neighbours: (P, k) of each point, itself the first.
         viewpoints: (V, 3).
+        between: called between the viewpoints.
     """
     to_viewpoints = viewpoints[None] - points[:, None]
     directions = to_viewpoints / to_viewpoints.norm(dim=2, keepdim=True).clamp(min=1e-9)
     along = (directions * normals[:, None]).sum(dim=2)
-    clear = torch.stack([_is_clear(points, normals, viewpoint) for viewpoint in viewpoints], dim=1)
+    views = []
+    for viewpoint in viewpoints:
+        between()
+        views.append(_is_clear(points, normals, viewpoint))
+    clear = torch.stack(views, dim=1)
     freedom = along * clear
     freer = freedom.amax(dim=1).clamp(min=0) + freedom.amin(dim=1).clamp(max=0)
     side = _mean_over_layer(freer, points, normals, neighbours)

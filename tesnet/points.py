@@ -5,6 +5,8 @@ Knows no query, no candidate and no hand. Vectorised torch on the device of its 
 
 from __future__ import annotations
 
+from collections.abc import Callable
+
 import torch
 from torch import Tensor
 
@@ -47,7 +49,9 @@ def members_of_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
     return member_of, counts
 
 
-def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) -> Tensor:
+def nearest_neighbours(
+    points: Tensor, k: int, queries: Tensor | None = None, between: Callable[[], None] = lambda: None
+) -> Tensor:
     """Indices (Q, k) of the points (P, 3) nearest to each query (Q, 3), nearest first.
 
     Queries default to the points themselves; each is then its own first neighbour. With fewer than k points the last
@@ -55,7 +59,7 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
 
     Points and queries are sorted along the points' longest axis, and a block of queries is compared with the slab of
     points around it only; the few queries whose k-th neighbour may lie outside the slab, and all queries of few points,
-    are compared with all.
+    are compared with all. `between` is called between the blocks.
     """
     sources = points if queries is None else queries
     available = min(k, len(points))
@@ -69,6 +73,7 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
     few = len(points) <= _FEW_POINTS
     unsure = [query_order] if few else []
     for rows in () if few else query_order.split(_SLAB_QUERIES):
+        between()
         block = wanted[rows]
         ends = torch.stack([block[0, longest] - _SLAB_MARGIN, block[-1, longest] + _SLAB_MARGIN])
         first, last = torch.searchsorted(places, ends).tolist()
@@ -79,6 +84,7 @@ def nearest_neighbours(points: Tensor, k: int, queries: Tensor | None = None) ->
         neighbours[rows] = order[found + first]
         unsure.append(rows[squares[:, -1] >= _SLAB_MARGIN**2])
     for rows in torch.cat(unsure).split(max(1, _LARGEST_TABLE // len(points))) if unsure else ():
+        between()
         neighbours[rows] = _nearest(wanted[rows], exact, available)[1]
     if queries is None:
         neighbours = _self_first(neighbours)
@@ -116,10 +122,12 @@ def statistical_outliers(points: Tensor, neighbours: Tensor, std_ratio: float) -
     return outliers
 
 
-def drop_points(points: Tensor, neighbours: Tensor, keep: Tensor) -> tuple[Tensor, Tensor]:
+def drop_points(
+    points: Tensor, neighbours: Tensor, keep: Tensor, between: Callable[[], None] = lambda: None
+) -> tuple[Tensor, Tensor]:
     """Points (P', 3) and exact neighbours (P', k) after dropping the points where `keep` (P,) is false.
 
-    Only rows that had a dropped neighbour are searched again.
+    Only rows that had a dropped neighbour are searched again, in blocks between which `between` is called.
     """
     if bool(keep.all()):
         return points, neighbours
@@ -128,9 +136,9 @@ def drop_points(points: Tensor, neighbours: Tensor, keep: Tensor) -> tuple[Tenso
     stale = (~keep[kept_neighbours]).any(dim=1)
     renumbered = new_index[kept_neighbours]
     if len(kept_points) < neighbours.shape[1]:
-        return kept_points, nearest_neighbours(kept_points, neighbours.shape[1])
+        return kept_points, nearest_neighbours(kept_points, neighbours.shape[1], between=between)
     if bool(stale.any()):
-        fresh = nearest_neighbours(kept_points, neighbours.shape[1], kept_points[stale])
+        fresh = nearest_neighbours(kept_points, neighbours.shape[1], kept_points[stale], between)
         own = stale.nonzero()[:, 0]
         moved = torch.where(fresh == own[:, None], 0, 1).sort(dim=1, stable=True).indices
         fresh = fresh.gather(1, moved)

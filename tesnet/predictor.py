@@ -196,7 +196,7 @@ class GraspPredictor:
         notes = [*_query_warnings(query), *corrected, *said, *_support_warnings(query)]
 
         clock.check()
-        prepared = cloud.prepare(query, self._preparation, self.device, plane)
+        prepared = cloud.prepare(query, self._preparation, self.device, plane, clock.check)
         self._synchronise()
         clock.lap("prepare")
         if prepared is not None:

@@ -5,6 +5,8 @@ Knows no hand. Vectorised torch; lengths in metres; everything in the cloud's ca
 
 from __future__ import annotations
 
+from functools import reduce
+
 import torch
 from torch import Tensor
 
@@ -35,8 +37,8 @@ def depth_behind(cloud: PreparedCloud, places: Tensor) -> Tensor:
     Negative in front of what is seen; -infinity where no observed point lies in that direction, so that the camera
     looked past the place. Positive for a place that every viewpoint's sight is blocked of.
     """
-    depths = torch.stack([_depth_behind(viewpoint, cloud.points, places) for viewpoint in cloud.viewpoints])
-    return depths.amin(dim=0)
+    depths = (_depth_behind(viewpoint, cloud.points, places) for viewpoint in cloud.viewpoints)
+    return reduce(torch.minimum, depths)  # one after the other: of all views together they take hundreds of MB
 
 
 def outside(cloud: PreparedCloud, places: Tensor) -> Tensor:
