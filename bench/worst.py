@@ -33,7 +33,7 @@ from service.settings import Settings
 from tesnet.errors import InvalidQuery, TesnetError
 from tesnet.geometry import WIDEST, Box, Gripper
 from tesnet.hands import HANDS
-from tesnet.predictor import GraspPredictor
+from tesnet.predictor import FURTHER_SEARCHES, MOST_SCORED, GraspPredictor
 from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_VIEWPOINTS, GraspQuery
 from tesnet.weights import default_weights
 
@@ -95,6 +95,7 @@ def options(query: GraspQuery) -> Mapping[str, Mapping[str, Any]]:
         "view_index": {"viewpoints": views, "view_index": np.arange(count) % MAX_VIEWPOINTS},
         "normals": {"normals": rng.normal(0, 1, (count, 3))},
         "target": {"target": rng.random(count) < 0.5},
+        "most searches": {"max_candidates": MOST_SCORED // FURTHER_SEARCHES, "num_approach_points": 1},
         "most grasps": {"max_grasps": MAX_GRASPS, "separation_translation": 0.0},
     }
 
@@ -122,8 +123,9 @@ def queries() -> Mapping[str, Callable[[], GraspQuery]]:
         if name != EVERYTHING:
             return replace(query, **{"support_height": None} | options(query)[name])
         for option in options(query).values():
-            with contextlib.suppress(InvalidQuery):  # beside another option
-                query = replace(query, **option)
+            if "max_candidates" not in option and ("up" not in option or query.up is None):
+                with contextlib.suppress(InvalidQuery):  # beside another option
+                    query = replace(query, **option)
         return query
 
     cases: dict[str, Callable[[], GraspQuery]] = dict(clouds())

@@ -169,6 +169,7 @@ class Limits:
     max_grasps: int
     max_approach_points: int
     max_candidates: int
+    max_candidates_of_large_hands: int
     queue_size: int
     max_timeout_s: float
 

@@ -30,7 +30,7 @@ from service.viewer import viewer
 from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
 from tesnet.geometry import FRAME_CONVENTIONS, PANDA
 from tesnet.hands import HANDS
-from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS
+from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_CANDIDATES_OF_LARGE_HANDS, MAX_GRASPS
 
 DESCRIPTION = """Point cloud in, ranked SE(3) grasps out. Lengths are metres; poses are in the frame of the request's
 points. In the default `panda` convention a grasp's origin is the TCP, +z is the direction of travel and +y the closing
@@ -177,6 +177,7 @@ def _describe(settings: Settings, worker: PredictionWorker) -> schemas.ModelResp
             max_grasps=MAX_GRASPS,
             max_approach_points=MAX_APPROACH_POINTS,
             max_candidates=MAX_CANDIDATES,
+            max_candidates_of_large_hands=MAX_CANDIDATES_OF_LARGE_HANDS,
             queue_size=settings.queue_size,
             max_timeout_s=schemas.MAX_TIMEOUT_S,
         ),

@@ -15,7 +15,7 @@ from pydantic import BaseModel, ConfigDict, Field, model_validator
 
 from tesnet.geometry import PANDA, WIDEST, FrameConvention, PartName
 from tesnet.hands import HANDS
-from tesnet.query import MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_SEED, MAX_VIEWPOINTS
+from tesnet.query import LARGE_HAND, MAX_APPROACH_POINTS, MAX_CANDIDATES, MAX_GRASPS, MAX_SEED, MAX_VIEWPOINTS
 from tesnet.result import Reason
 
 REQUEST_ID = r"[A-Za-z0-9._:/+=-]{1,128}"
@@ -463,6 +463,9 @@ class LimitsOut(ResponsePart):
     max_grasps: int = Field(description="Largest `max_grasps`.")
     max_approach_points: int = Field(description="Largest `num_approach_points`.")
     max_candidates: int = Field(description="Largest `max_candidates`.")
+    max_candidates_of_large_hands: int = Field(
+        description=f"Candidates that are looked for at most where a part of the hand is longer than {LARGE_HAND:g} m."
+    )
     queue_size: int = Field(description="Requests that may wait for the predictor.")
     max_timeout_s: float = Field(description="Largest X-Request-Timeout, seconds.")
 

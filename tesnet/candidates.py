@@ -47,6 +47,9 @@ _NEARLY_FARTHEST = 0.7
 _PAIRS_AT_ONCE = 500_000
 """Pairs of points whose offsets are in memory at a time, some 20 MB."""
 
+MOST_PAIRS = 500_000
+"""Of more pairs in reach so many are tried, spread evenly: hands with very long fingers reach millions."""
+
 
 @dataclass(frozen=True, slots=True)
 class CandidateConfig:
@@ -124,7 +127,11 @@ class Candidates:
 
 
 def generate(
-    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, edges: Callable[[], Outline] | None = None
+    cloud: PreparedCloud,
+    query: GraspQuery,
+    config: CandidateConfig,
+    edges: Callable[[], Outline] | None = None,
+    between: Callable[[], None] = lambda: None,
 ) -> tuple[Candidates, dict[str, int]]:
     """At most `max_candidates` candidates, and how many pairs each mask dropped.
 
@@ -136,6 +143,7 @@ def generate(
         query: what is asked.
         config: the limits.
         edges: finds the cloud's outline, for who searches one cloud several times.
+        between: called between blocks of work of some tens of milliseconds.
     """
     allowed = torch.arange(len(cloud), device=cloud.points.device)
     if cloud.on_target is not None:
@@ -148,18 +156,19 @@ def generate(
     count = query.num_approach_points
     while True:
         approach_points = allowed[farthest_points(cloud.points[allowed], count, start)]
-        candidates, alive, rejected = _search(cloud, query, config, approach_points)
-        if 2 * int(alive.sum()) >= query.max_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
+        candidates, alive, rejected = _search(cloud, query, config, approach_points, between)
+        if 2 * int(alive.sum()) >= query.most_candidates or count >= min(len(allowed), MAX_APPROACH_POINTS):
             break
         count = more_approach_points(count)
     edges = edges or partial(outline, cloud, query)
     for made in _without_walls(cloud, query, config, approach_points, int(alive.sum()), edges):
+        between()
         others, also_alive, also_rejected = _judge(cloud, query, config, made)
         candidates, alive = candidates.joined_by(others), torch.cat([alive, also_alive])
         rejected = {name: count + also_rejected[name] for name, count in rejected.items()}
     survivors = alive.nonzero()[:, 0]
-    if len(survivors) > query.max_candidates:
-        chosen = torch.randperm(len(survivors), generator=generator)[: query.max_candidates].sort().values
+    if len(survivors) > query.most_candidates:
+        chosen = torch.randperm(len(survivors), generator=generator)[: query.most_candidates].sort().values
         survivors = survivors[chosen.to(survivors.device)]
     return _fitted(cloud, query, config, candidates.select(survivors)), rejected
 
@@ -192,12 +201,18 @@ def _no_candidates(cloud: PreparedCloud, hand: Gripper) -> Candidates:
 
 
 def _search(
-    cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, approach_points: Tensor
+    cloud: PreparedCloud,
+    query: GraspQuery,
+    config: CandidateConfig,
+    approach_points: Tensor,
+    between: Callable[[], None],
 ) -> tuple[Candidates, Tensor, dict[str, int]]:
     """The pairs in reach of the approach points, a mask of those that no rule drops, and how many each rule does."""
     normals = contact_normals(cloud, config)
-    approach, contact = pairs_in_reach(cloud.points, normals, approach_points, config)
+    approach, contact = _at_most(MOST_PAIRS, *pairs_in_reach(cloud.points, normals, approach_points, config, between))
+    between()
     poses = grasp_poses(cloud.points[approach], cloud.points[contact], normals[contact], hand=query.gripper)
+    between()
     candidates = Candidates(approach, contact, poses, wide_open(poses, query.gripper), query.gripper)
     return _judge(cloud, query, config, candidates)
 
@@ -214,6 +229,14 @@ def _fitted(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, ca
         Ts_canonical_grasp=torch.where(low[:, None, None], candidates.Ts_canonical_grasp, moved.Ts_canonical_grasp),
         widths=torch.where(low, candidates.widths, moved.widths),
     )
+
+
+def _at_most(limit: int, approach: Tensor, contact: Tensor) -> tuple[Tensor, Tensor]:
+    """The pairs (C,), (C,), or so many of them, spread evenly over their order."""
+    if len(approach) <= limit:
+        return approach, contact
+    kept = torch.arange(limit, device=approach.device) * len(approach) // limit
+    return approach[kept], contact[kept]
 
 
 def _judge(
@@ -375,7 +398,11 @@ def contact_normals(cloud: PreparedCloud, config: CandidateConfig) -> Tensor:
 
 
 def pairs_in_reach(
-    points: Tensor, normals: Tensor, approach_points: Tensor, config: CandidateConfig
+    points: Tensor,
+    normals: Tensor,
+    approach_points: Tensor,
+    config: CandidateConfig,
+    between: Callable[[], None] = lambda: None,
 ) -> tuple[Tensor, Tensor]:
     """Indices (C,), (C,) of approach and contact points that satisfy the limits on distance, depth and offset.
 
@@ -384,11 +411,12 @@ def pairs_in_reach(
         normals: (P, 3) as contact points.
         approach_points: (A,) indices.
         config: the limits.
+        between: called between blocks of work of some tens of milliseconds.
     """
-    found = [
-        _pairs_of_some(points, normals, some, config)
-        for some in approach_points.split(max(1, _PAIRS_AT_ONCE // max(1, len(points))))
-    ]
+    found = []
+    for some in approach_points.split(max(1, _PAIRS_AT_ONCE // max(1, len(points)))):
+        between()
+        found.append(_pairs_of_some(points, normals, some, config))
     return torch.cat([approach for approach, _ in found]), torch.cat([contact for _, contact in found])
 
 

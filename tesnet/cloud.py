@@ -191,8 +191,6 @@ def prepare(
     outward = None if _outward(query) is None else table[:, -3:] @ torch.tensor(T_cloud_canonical.rotation).to(table)
     points = table[:, :3].contiguous()
 
-    between()
-
     neighbours = nearest_neighbours(
         points, max(config.normal_neighbours, config.outlier_neighbours + 1), between=between
     )
@@ -202,7 +200,6 @@ def prepare(
     outward = None if outward is None else outward[keep]
     normals, spectrum = estimate_normals(points, neighbours[:, : config.normal_neighbours], config.normal_radius)
     graph = neighbours[:, : config.graph_neighbours]
-    between()
     normals, view_directions = orient(points, normals, graph, viewpoints, outward, between)
     support_height = None
     if query.known_up is not None and isinstance(query.support_height, float):
@@ -343,10 +340,11 @@ def canonical_frame(points: Tensor, viewpoints: Tensor, up: Tensor | None) -> Po
     cloud = points.double()
     centroid = cloud.mean(dim=0)
     to_viewer = viewpoints[0].double() - centroid
+    rounding = 1e-12 * float(to_viewer.norm())  # of a far cloud, which is no direction
     z = _unit_or_none(to_viewer) if up is None else up.double()
     if z is None:
         z = torch.tensor([0.0, 0.0, 1.0], dtype=torch.float64, device=points.device)
-    x = _unit_or_none(to_viewer - (to_viewer @ z) * z)
+    x = _unit_or_none(to_viewer - (to_viewer @ z) * z, rounding)
     if x is None:
         centred = cloud - centroid
         flat = centred - (centred @ z)[:, None] * z
@@ -363,9 +361,9 @@ def canonical_frame(points: Tensor, viewpoints: Tensor, up: Tensor | None) -> Po
     return Pose(rotation.cpu().numpy(), centroid.cpu().numpy())
 
 
-def _unit_or_none(vector: Tensor) -> Tensor | None:
+def _unit_or_none(vector: Tensor, rounding: float = 0.0) -> Tensor | None:
     length = vector.norm()
-    return None if float(length) < 1e-6 else vector / length
+    return None if float(length) < max(1e-6, rounding) else vector / length
 
 
 def _on_target(query: GraspQuery, table: Tensor, T_cloud_canonical: Pose) -> Tensor | None:

@@ -29,6 +29,9 @@ BORDER = 0.005
 REACH_BEYOND = 0.04
 """How far beyond the workspace things are taken to go on."""
 
+MOST_BEYOND = 12_000
+"""Such places; of more, as where a surface runs along a side, they are thinned evenly."""
+
 HELD_DEPTH = 0.004
 HELD_POINTS = 10
 """Of a hand that a robot would drive into things: so many posted points lie so deep in it."""
@@ -36,6 +39,9 @@ HELD_POINTS = 10
 _BLOCK = 4_000_000
 _COARSE_STRIDES = (36, 6)
 """Most collisions show with every so many points."""
+
+_STRIDES = (400, 20, 1)
+"""Obstacles are tried from few to all, each time with the hands that met none."""
 
 
 def blocked(
@@ -64,7 +70,8 @@ def blocked(
     if not bool((mask | unsafe).all()):
         mask |= unsafe
     if unseen == "occupied":
-        mask |= in_shadow(cloud, poses, gripper, widths)
+        free = ~mask
+        mask[free] = in_shadow(cloud, poses[free], gripper, widths[free], between)
     return mask
 
 
@@ -73,13 +80,18 @@ def _meets(
 ) -> Tensor:
     """Mask (C,) of the candidates, among those asked about (C,), whose hand meets an obstacle on its way."""
     met = torch.zeros_like(asked)
-    poses, widths = candidates.Ts_canonical_grasp[asked], candidates.widths[asked]
-    found = obstacles.count_in_hands(poses, gripper, widths, distance=APPROACH_DISTANCE, between=between)
-    met[asked] = found > 0
+    # A large hand in a dense cloud holds a hundred thousand obstacles, of which one tells that it does.
+    for stride in _STRIDES:
+        some = Obstacles.of(obstacles.points[::stride])
+        open_rows = (asked & ~met).nonzero()[:, 0]
+        poses, widths = candidates.Ts_canonical_grasp[open_rows], candidates.widths[open_rows]
+        met[open_rows] = some.count_in_hands(poses, gripper, widths, distance=APPROACH_DISTANCE, between=between) > 0
     return met
 
 
-def holds(posted: Obstacles, candidates: Candidates, gripper: Gripper) -> Tensor:
+def holds(
+    posted: Obstacles, candidates: Candidates, gripper: Gripper, between: Callable[[], None] = lambda: None
+) -> Tensor:
     """Mask (C,): posted points lie well inside the open hand at the grasp, `HELD_POINTS` or more `HELD_DEPTH` deep.
 
     The last word on grasps that are to be returned: `blocked` looks at cells, and leaves out points that stand alone.
@@ -88,9 +100,10 @@ def holds(posted: Obstacles, candidates: Candidates, gripper: Gripper) -> Tensor
         posted: every point of the query that is in reach of the hands, its support's included.
         candidates: C of them.
         gripper: the hand.
+        between: called between blocks of work of some milliseconds.
     """
     poses, widths = candidates.Ts_canonical_grasp, candidates.widths
-    return posted.count_in_hands(poses, gripper, widths, depth=HELD_DEPTH) >= HELD_POINTS
+    return posted.count_in_hands(poses, gripper, widths, depth=HELD_DEPTH, between=between) >= HELD_POINTS
 
 
 def in_reach(posted: Tensor, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Obstacles:
@@ -145,14 +158,22 @@ def beyond(cloud: PreparedCloud) -> Tensor:
     steps = torch.arange(BORDER, REACH_BEYOND, BORDER, device=cloud.points.device)
     distance = cloud.points @ cloud.sides[:, :3].T - cloud.sides[:, 3]
     point, side = (distance.abs() < BORDER).nonzero(as_tuple=True)
-    places = cloud.points[point][:, None] + steps[:, None] * cloud.sides[side, None, :3]
+    some = slice(None, None, 1 + len(point) * len(steps) // MOST_BEYOND)
+    places = cloud.points[point[some]][:, None] + steps[:, None] * cloud.sides[side[some], None, :3]
     return places.reshape(-1, 3)
 
 
-def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, widths: Tensor | float) -> Tensor:
+def in_shadow(
+    cloud: PreparedCloud,
+    Ts_canonical_grasp: Tensor,
+    gripper: Gripper,
+    widths: Tensor | float,
+    between: Callable[[], None] = lambda: None,
+) -> Tensor:
     """Mask (C,): part of the hand at the grasp lies where every viewpoint's sight is blocked by observed points.
 
-    The fingers and the palm's front are sampled, for hands open by `widths`, (C,) or one for all.
+    The fingers and the palm's front are sampled, for hands open by `widths`, (C,) or one for all. `between` is called
+    between the viewpoints.
     """
     samples = torch.tensor(
         [(*place, part.side / 2) for part in gripper.parts for place in _samples(part)],
@@ -163,7 +184,7 @@ def in_shadow(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper
     widths = torch.as_tensor(widths, device=local.device).expand(len(local))
     local[:, :, 1] += widths[:, None] * samples[:, 3]
     places = local @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
-    return hidden(cloud, places).any(dim=1)
+    return hidden(cloud, places, between=between).any(dim=1)
 
 
 def _samples(part: Part) -> list[tuple[float, float, float]]:

@@ -19,8 +19,8 @@ BLOCK_SIZE = 0.025
 """Edge of a block: many lie within a hand, and one holds some dozen cells of a surface."""
 
 _POSES_AT_ONCE = 512
-_PAIRS_AT_ONCE = 1_000_000
-"""Pairs of a hand and a point that are in memory at a time, some 40 MB."""
+_PAIRS_AT_ONCE = 250_000
+"""Pairs of a hand and a point that are in memory at a time, some 10 MB."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -19,7 +19,7 @@ from tesnet.geometry import PANDA, Box, GraspSet, Pose
 from tesnet.networks import Network
 from tesnet.outline import Outline, outline
 from tesnet.points import nearest_neighbours
-from tesnet.query import MAX_SEED, NO_VIEWPOINT, GraspQuery
+from tesnet.query import MAX_CANDIDATES, MAX_SEED, NO_VIEWPOINT, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 from tesnet.threads import Threads
 
@@ -33,7 +33,11 @@ FURTHER_SEARCHES = 4
 """At most so often, each time with four times as many approach points as the query names."""
 
 MOST_SCORED = 10_000
-"""Candidates in all further searches together: who asks for many at once has had them."""
+"""Candidates in all further searches together, fewer where the hand may have fewer: who asks for many at once has had
+them."""
+
+_SCORED_AT_ONCE = 2_500
+"""Candidates, of which requests have 2,000 unless they ask for more."""
 
 _RANKINGS = 4
 """At most so often grasps are ranked, less those that turn out to hold posted points."""
@@ -223,7 +227,7 @@ class GraspPredictor:
         self, prepared: cloud.PreparedCloud, query: GraspQuery, edges: Callable[[], Outline], clock: _Clock
     ) -> _Found:
         clock.check()
-        found, rejected = candidates.generate(prepared, query, self._candidates, edges)
+        found, rejected = candidates.generate(prepared, query, self._candidates, edges, clock.check)
         clock.check()
         blocked = collision.blocked(prepared, found, query.gripper, query.unseen, clock.check)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
@@ -250,7 +254,7 @@ class GraspPredictor:
         found, scores = self._best_search(proposal, features)
         posted = torch.from_numpy(query.points.copy()).to(self.device)
         posted = cloud.in_canonical_frame(posted, prepared.T_cloud_canonical)
-        found, scores, ranked = _ranked_clear(posted, found, scores, query)
+        found, scores, ranked = _ranked_clear(posted, found, scores, query, clock)
         last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
         rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
         grasps = _grasps(query, prepared, found.free, scores, ranked.indices)
@@ -269,27 +273,31 @@ class GraspPredictor:
         With the scores (C,) of its free candidates.
         """
         query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
-        found, scores = proposal.found, self._scores(features, prepared, proposal.found)
+        found, scores = proposal.found, self._scores(features, prepared, proposal.found, clock)
         clock.lap("network")
         for number in range(1, FURTHER_SEARCHES + 1):
             # Where a search yields few candidates it has tried every approach point.
-            enough = number * query.max_candidates > MOST_SCORED
-            if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.max_candidates or enough:
+            enough = number * query.most_candidates > MOST_SCORED * query.candidate_limit / MAX_CANDIDATES
+            if float(scores.max()) >= GOOD_SCORE or 2 * found.count < query.most_candidates or enough:
                 break
             other = self._search(prepared, _further(query, number), proposal.edges, clock)
             self._synchronise()
             clock.lap("candidates")
             if len(other.free):
-                clock.check()
-                other_scores = self._scores(features, prepared, other)
+                other_scores = self._scores(features, prepared, other, clock)
                 if float(other_scores.max()) > float(scores.max()):
                     found, scores = other, other_scores
                 clock.lap("network")
         return found, scores
 
-    def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Found) -> torch.Tensor:
+    def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Found, clock: _Clock) -> torch.Tensor:
+        """(F,) of the free candidates, of which so many are scored together that the clock is looked at often."""
         a, b = self._calibration
-        scores = torch.sigmoid(a * self._network.score(features, prepared, found.free) + b)
+        logits = []
+        for rows in torch.arange(len(found.free), device=self.device).split(_SCORED_AT_ONCE):
+            clock.check()
+            logits.append(self._network.score(features, prepared, found.free.select(rows)))
+        scores = torch.sigmoid(a * torch.cat(logits) + b)
         self._synchronise()
         return scores
 
@@ -386,7 +394,7 @@ def _ranked(found: _Found, scores: torch.Tensor, query: GraspQuery) -> ranking.R
 
 
 def _ranked_clear(
-    posted: torch.Tensor, found: _Found, scores: torch.Tensor, query: GraspQuery
+    posted: torch.Tensor, found: _Found, scores: torch.Tensor, query: GraspQuery, clock: _Clock
 ) -> tuple[_Found, torch.Tensor, ranking.Ranking]:
     """The ranking of grasps that hold none of the posted points (N, 3), and the search and scores that are left.
 
@@ -396,7 +404,7 @@ def _ranked_clear(
     for number in itertools.count(1):
         ranked = _ranked(found, scores, query)
         asked = (ranked.indices if number < _RANKINGS else torch.arange(len(scores))).to(scores.device)
-        held = collision.holds(obstacles, found.free.select(asked), query.gripper)
+        held = collision.holds(obstacles, found.free.select(asked), query.gripper, clock.check)
         if not bool(held.any()):
             break
         clear = torch.ones(len(scores), dtype=torch.bool, device=scores.device)

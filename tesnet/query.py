@@ -19,12 +19,15 @@ from tesnet.geometry import PANDA, WIDEST, Box, Gripper
 MAX_GRASPS = 1000
 MAX_APPROACH_POINTS = 1024
 MAX_CANDIDATES = 20_000
+LARGE_HAND = 0.25
+MAX_CANDIDATES_OF_LARGE_HANDS = 2_000
+"""Of a hand with a part longer than `LARGE_HAND`, metres, and so than any known hand: what it may meet takes long."""
 MAX_VIEWPOINTS = 64
 MAX_SEED = 2**63 - 1
 MAX_DIAGONAL = 20.0
 """Metres; a cloud whose central 90 % spans more was not given in metres."""
 MAX_DISTANCE = 1e9
-"""Metres from the origin at which viewpoints and support planes still count as given in metres."""
+"""Metres from the origin at which viewpoints, support planes and most of a cloud still count as given in metres."""
 FAR = 64.0
 """Metres from the origin from which on float32 rounds coordinates by 4 micrometres or more."""
 NO_VIEWPOINT = "viewpoint not given: the camera is taken to be at the origin of the cloud frame"
@@ -153,6 +156,17 @@ class GraspQuery:
         _one_of("unseen", self.unseen, "free", "occupied")
         _one_of("width", self.width, "fitted", "full")
         _one_of("calibrate", self.calibrate, True, False)
+
+    @property
+    def candidate_limit(self) -> int:
+        """How many candidates this hand may have, and so `max_candidates` mean at most."""
+        lengths = (size for name, size in self.gripper.sizes().items() if name != "hand_yaw" and size is not None)
+        return MAX_CANDIDATES_OF_LARGE_HANDS if max(lengths) > LARGE_HAND else MAX_CANDIDATES
+
+    @property
+    def most_candidates(self) -> int:
+        """How many candidates are looked for."""
+        return min(self.max_candidates, self.candidate_limit)
 
     @property
     def offset(self) -> NDArray[np.float64]:
@@ -298,8 +312,18 @@ def _cloud(points: ArrayLike, origin: NDArray[np.float64]) -> NDArray[np.float32
                 f"span {diagonal:.0f} m (diagonal of the central 90 %; limit {MAX_DIAGONAL:g} m); "
                 "coordinates must be in metres: divide millimetres by 1000, centimetres by 100, inches by 39.37",
             )
+        if np.abs(array).max() > MAX_DISTANCE and (far := _farthest_middle(array)) > MAX_DISTANCE:
+            raise InvalidQuery(
+                "points",
+                f"lie {far:.3g} m from the origin (limit {MAX_DISTANCE:g} m); send metres, in a frame near them",
+            )
     array.setflags(write=False)
     return array
+
+
+def _farthest_middle(points: NDArray[np.float32]) -> float:
+    """The largest coordinate, either way, of the median of points (N, 3)."""
+    return float(np.abs(np.median(points.astype(np.float64), axis=0)).max())
 
 
 def _vector(field: str, value: ArrayLike, shape: tuple[int, ...]) -> NDArray[np.float64]:

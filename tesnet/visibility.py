@@ -5,7 +5,7 @@ Knows no hand. Vectorised torch; lengths in metres; everything in the cloud's ca
 
 from __future__ import annotations
 
-from functools import reduce
+from collections.abc import Callable
 
 import torch
 from torch import Tensor
@@ -20,25 +20,35 @@ FINE_SHADOW_MARGIN = 0.003
 """The same where the cloud's cells are so fine that the surface stands at its place."""
 
 
-def hidden(cloud: PreparedCloud, places: Tensor, margin: float = SHADOW_MARGIN) -> Tensor:
+def hidden(
+    cloud: PreparedCloud,
+    places: Tensor,
+    margin: float = SHADOW_MARGIN,
+    between: Callable[[], None] = lambda: None,
+) -> Tensor:
     """Mask (...) of the places (..., 3) of which observed points block the sight of every viewpoint.
 
     Args:
         cloud: what was observed.
         places: anywhere.
         margin: a place no deeper than this behind what covers it counts as seen, metres.
+        between: called between the viewpoints.
     """
-    return depth_behind(cloud, places) > margin
+    return depth_behind(cloud, places, between) > margin
 
 
-def depth_behind(cloud: PreparedCloud, places: Tensor) -> Tensor:
+def depth_behind(cloud: PreparedCloud, places: Tensor, between: Callable[[], None] = lambda: None) -> Tensor:
     """How far places (..., 3) lie behind the surface that covers them, seen from the viewpoint that sees them best.
 
     Negative in front of what is seen; -infinity where no observed point lies in that direction, so that the camera
-    looked past the place. Positive for a place that every viewpoint's sight is blocked of.
+    looked past the place. Positive for a place that every viewpoint's sight is blocked of. `between` is called
+    between the viewpoints.
     """
-    depths = (_depth_behind(viewpoint, cloud.points, places) for viewpoint in cloud.viewpoints)
-    return reduce(torch.minimum, depths)  # one after the other: of all views together they take hundreds of MB
+    least = torch.full(places.shape[:-1], torch.inf, dtype=places.dtype, device=places.device)
+    for viewpoint in cloud.viewpoints:  # one after the other: of all together they take hundreds of MB
+        between()
+        least = torch.minimum(least, _depth_behind(viewpoint, cloud.points, places))
+    return least
 
 
 def outside(cloud: PreparedCloud, places: Tensor) -> Tensor:

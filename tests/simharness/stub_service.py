@@ -73,6 +73,7 @@ class Handler(BaseHTTPRequestHandler):
                     "max_grasps",
                     "max_approach_points",
                     "max_candidates",
+                    "max_candidates_of_large_hands",
                     "queue_size",
                     "max_timeout_s",
                 ),

@@ -10,8 +10,17 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tesnet.errors import InvalidQuery, TesnetError
-from tesnet.geometry import Box
-from tesnet.query import NO_VIEWPOINT, ApproachCone, box_option
+from tesnet.geometry import PANDA, Box
+from tesnet.hands import HANDS
+from tesnet.query import (
+    LARGE_HAND,
+    MAX_CANDIDATES,
+    MAX_CANDIDATES_OF_LARGE_HANDS,
+    NO_VIEWPOINT,
+    ApproachCone,
+    GraspQuery,
+    box_option,
+)
 from tests.tesnet.scenes import UP, ask
 
 POINTS = np.random.default_rng(0).uniform(-0.1, 0.1, (50, 3))
@@ -211,3 +220,24 @@ def test_the_origin_as_default_viewpoint_is_told_of_a_far_cloud_too() -> None:
     assert far.notes == (NO_VIEWPOINT,)
     np.testing.assert_array_equal(far.viewpoints, [-far.offset])
     assert ask(POINTS).notes == ()
+
+
+@pytest.mark.parametrize("distance", [1.1e9, 2e9, 1e12, 1e30, 3.4e38])
+@pytest.mark.parametrize("dtype", [np.float32, np.float64])
+def test_a_cloud_that_lies_nowhere_near_is_refused_and_a_few_such_points_are_not(distance: float, dtype: type) -> None:
+    points = np.random.default_rng(0).uniform(0, 0.1, (100, 3)).astype(dtype)
+    with pytest.raises(InvalidQuery, match=r"m from the origin \(limit 1e\+09 m\)"):
+        GraspQuery(points + dtype(distance))
+    points[:3] = distance
+    assert len(GraspQuery(points).points) == 100
+
+
+@pytest.mark.parametrize("part", ["hand_to_tcp", "palm_length"])
+def test_a_hand_with_a_very_long_part_has_fewer_candidates(part: str) -> None:
+    points = np.zeros((1, 3))
+    for name, hand in HANDS.items():
+        assert GraspQuery(points, gripper=hand.gripper, max_candidates=MAX_CANDIDATES).most_candidates == 20_000, name
+    large = replace(PANDA, **{part: LARGE_HAND + 0.01})
+    asked = GraspQuery(points, gripper=large, max_candidates=MAX_CANDIDATES)
+    assert asked.most_candidates == asked.candidate_limit == MAX_CANDIDATES_OF_LARGE_HANDS
+    assert GraspQuery(points, gripper=large, max_candidates=7).most_candidates == 7

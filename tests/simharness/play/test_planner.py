@@ -196,6 +196,7 @@ def model_document(name: str) -> dict[str, Any]:
         "max_grasps",
         "max_approach_points",
         "max_candidates",
+        "max_candidates_of_large_hands",
         "queue_size",
         "max_timeout_s",
     )
