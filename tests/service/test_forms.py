@@ -520,5 +520,14 @@ def form_decoder(files: dict[str, bytes]) -> Callable[[dict[str, Any]], Payload]
     return decode
 
 
+@pytest.mark.parametrize(("place", "value"), [(26, 7), (26, 1), (27, 1), (28, 2)])
+def test_a_png_of_a_method_that_there_is_not_is_a_400(http: httpx.Client, place: int, value: int) -> None:
+    """Of compression, filtering and interlacing (PNG specification, 11.2.2); the head's checksum is right."""
+    image = bytearray(DEPTH)
+    image[place] = value
+    image[29:33] = struct.pack(">I", zlib.crc32(image[12:29]))
+    problem_of(post(http, {"depth": bytes(image)}, CAMERA), 400, "methods", str(value))
+
+
 def test_the_service_is_well_after_bad_forms(http: httpx.Client) -> None:
     assert 'status="500"' not in http.get("/metrics").text

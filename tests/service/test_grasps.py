@@ -16,7 +16,7 @@ import pytest
 from service import payloads
 from service.grasps import SMALL_BODY
 from tests.conftest import PATIENCE_S
-from tests.service.wire import OCTETS, POINTS, connect, post, post_head
+from tests.service.wire import OCTETS, POINTS, connect, post, post_head, status_of
 
 Serve = Callable[..., Any]
 Eventually = Callable[[Callable[[], bool]], None]
@@ -115,7 +115,7 @@ def test_the_default_deadline_is_a_setting(serve: Serve) -> None:
 
 def test_a_body_that_does_not_arrive_in_time_is_a_504(serve: Serve) -> None:
     with post_head(serve(request_timeout=0.2).url) as connection:
-        assert connection.recv(4096).startswith(b"HTTP/1.1 504 ")
+        assert status_of(connection) == 504
 
 
 def test_a_client_that_hangs_up_frees_its_place_in_the_queue(
@@ -264,6 +264,33 @@ def test_one_key_cannot_take_all_places(
     eventually(lambda: server.endpoint._worker.depth == 3)
     server.predictor.gate.set()
     assert [answer.result().status_code for answer in (running, *waiting, other)] == [200] * 4
+
+
+def test_one_address_behind_a_trusted_proxy_cannot_take_all_places(
+    serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, eventually: Eventually
+) -> None:
+    server = serve(queue_size=4, trusted_proxies="127.0.0.1", client_places=1)
+    running = pool.submit(post, server.url, X_Forwarded_For="10.1.1.1")
+    assert server.predictor.entered.acquire(timeout=PATIENCE_S)
+    waiting = pool.submit(post, server.url, X_Forwarded_For="10.1.1.1")
+    eventually(lambda: server.endpoint._worker.depth == 1)
+    refused = post(server.url, X_Forwarded_For="10.1.1.1")
+    assert (refused.status_code, "of yours" in refused.json()["detail"]) == (429, True)
+    other = pool.submit(post, server.url, X_Forwarded_For="10.1.1.2")
+    eventually(lambda: server.endpoint._worker.depth == 2)
+    server.predictor.gate.set()
+    assert [answer.result().status_code for answer in (running, waiting, other)] == [200] * 3
+
+
+def test_without_trusted_proxies_an_address_means_nothing(
+    serve: Serve, pool: concurrent.futures.ThreadPoolExecutor, eventually: Eventually
+) -> None:
+    server = serve(queue_size=4, client_places=1)
+    asked = [pool.submit(post, server.url, X_Forwarded_For="10.1.1.1") for _ in range(4)]
+    assert server.predictor.entered.acquire(timeout=PATIENCE_S)
+    eventually(lambda: server.endpoint._worker.depth == 3)
+    server.predictor.gate.set()
+    assert [answer.result().status_code for answer in asked] == [200] * 4
 
 
 def test_a_lone_client_is_never_told_that_the_queue_is_full(serve: Serve) -> None:

@@ -19,6 +19,7 @@ import pytest
 
 from tesnet.weights import SUMS, default_weights
 from tests.conftest import PATIENCE_S, SERVED_HERE, hears
+from tests.service.wire import status_of
 
 StartService = Callable[..., Any]
 
@@ -45,7 +46,7 @@ def half_a_request(url: str) -> socket.socket:
         f"POST /grasps HTTP/1.1\r\nHost: test\r\nContent-Type: application/octet-stream\r\n"
         f"Content-Length: {len(POINTS)}\r\nExpect: 100-continue\r\n\r\n".encode()
     )
-    assert connection.recv(4096).startswith(b"HTTP/1.1 100 ")  # the service has begun to read the body
+    assert status_of(connection) == 100  # the service has begun to read the body
     return connection
 
 
@@ -60,7 +61,7 @@ def test_sigterm_refuses_what_is_new_finishes_what_was_taken_and_exits_with_0(st
             refused = httpx.post(f"{service.url}/grasps", json={"points": []})
             assert (refused.status_code, refused.headers["Retry-After"]) == (503, "1")
             connection.sendall(POINTS)
-            assert connection.recv(4096).startswith(b"HTTP/1.1 200 ")
+            assert status_of(connection) == 200
         assert service.process.wait(PATIENCE_S) == 0
         service.wait_for("stopped")
         assert service.process.stderr.read() == ""
@@ -82,7 +83,7 @@ def test_the_drain_timeout_ends_a_request_that_never_ends(start_service: StartSe
         service.wait_for("ready")
         with half_a_request(service.url) as connection:
             service.process.send_signal(signal.SIGINT)
-            assert connection.recv(4096).startswith(b"HTTP/1.1 503 ")
+            assert status_of(connection) == 503
             assert service.process.wait(PATIENCE_S) == 0
         service.wait_for("request", status=503)
 
@@ -165,3 +166,18 @@ def test_help_names_every_setting_and_version_is_told() -> None:
         assert name in helped.stdout
     assert run("--version").stdout.startswith("tes-net ")
     assert run("--what").returncode == 2
+
+
+@pytest.mark.parametrize("closed", [">&-", "2>&-", "<&- >&- 2>&-"])
+def test_standard_files_that_nobody_opened_stop_nothing(closed: str) -> None:
+    command = f'exec "{sys.executable}" -m service --version {closed}'
+    ended = subprocess.run(["/bin/sh", "-c", command], stderr=subprocess.PIPE, timeout=PATIENCE_S, check=False)
+    assert (ended.returncode, ended.stderr) == (0, b"")
+    with socket.create_server(("127.0.0.1", 0)) as taken:
+        environment = {**os.environ, **SERVED_HERE, "GRASP_PORT": str(taken.getsockname()[1])}
+        command = f'exec "{sys.executable}" -m service {closed}'
+        ended = subprocess.run(
+            ["/bin/sh", "-c", command], env=environment, stderr=subprocess.PIPE, timeout=PATIENCE_S, check=False
+        )
+        assert ended.returncode == 2
+        assert b"Traceback" not in ended.stderr

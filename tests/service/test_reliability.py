@@ -24,7 +24,7 @@ from client import GraspClient
 from client.retry import RetryPolicy
 from simharness.play.server import free_port
 from tests.conftest import PATIENCE_S, SERVED_HERE
-from tests.service.wire import POINTS, connect
+from tests.service.wire import POINTS, connect, status_of
 
 Cloud = NDArray[np.float32]
 Eventually = Callable[[Callable[[], bool]], None]
@@ -48,7 +48,7 @@ def begin(url: str) -> socket.socket:
     """A connection whose request was taken and whose body is awaited."""
     connection = connect(url)
     connection.sendall(HEAD)
-    assert connection.recv(4096).startswith(b"HTTP/1.1 100 ")
+    assert status_of(connection) == 100
     return connection
 
 

@@ -42,6 +42,16 @@ def post_head(url: str, path: str = "/grasps", length: int = len(POINTS), header
     return connection
 
 
+def status_of(connection: socket.socket) -> int:
+    """The status of the answer that comes next, whose head is read to its end however it is cut into packets."""
+    head = b""
+    while not head.endswith(b"\r\n\r\n"):
+        part = connection.recv(1)
+        assert part, head
+        head += part
+    return int(head.split()[1])
+
+
 def npy(array: NDArray[Any], **options: Any) -> bytes:
     """The content of a .npy file."""
     file = io.BytesIO()
