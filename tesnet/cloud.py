@@ -264,12 +264,6 @@ def _outward(query: GraspQuery) -> Tensor | None:
     return torch.nn.functional.normalize(torch.from_numpy(to_viewer), dim=1).float()
 
 
-def crop(points: Tensor, query: GraspQuery) -> Tensor:
-    """Rows (N, 3 or more), beginning with x, y, z, inside the query's workspace and clear of its support plane."""
-    points = above_support(points, query)
-    return points[in_workspace(points, query)]
-
-
 def above_support(points: Tensor, query: GraspQuery, noise: float = SUPPORT_NOISE) -> Tensor:
     """Rows (N, 3 or more), beginning with x, y, z, that are not lower than a noise above the query's support plane."""
     if query.known_up is None or not isinstance(query.support_height, float):

@@ -19,9 +19,6 @@ from tesnet.geometry import PANDA, Extent, Gripper, Part, PartName, Pose, quater
 from tesnet.hands import HANDS, KnownHand
 
 FRANKA = HANDS["franka"]
-MAX_WIDTH = PANDA.max_width
-"""Of the Franka hand."""
-
 FINGER_BASE = 0.0584
 """Metres from the Franka hand's base to where its fingers begin, along z."""
 

@@ -8,11 +8,13 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
 from tesnet import cloud
 from tesnet.geometry import Box, Pose
+from tesnet.query import GraspQuery
 from tests.tesnet.raycast import Can, around, cast
 from tests.tesnet.scenes import (
     CAMERA,
@@ -85,15 +87,21 @@ def test_there_is_a_canonical_frame_where_symmetry_leaves_it_open(
 # The whole preparation
 
 
+def cropped(points: NDArray[np.float32], query: GraspQuery) -> NDArray[np.float32]:
+    above = cloud.above_support(torch.from_numpy(points), query)
+    kept: NDArray[np.float32] = above[cloud.in_workspace(above, query)].numpy()
+    return kept
+
+
 def test_cropping_keeps_the_workspace_above_the_support() -> None:
     rng = np.random.default_rng(0)
     points = rng.uniform(-1, 1, (3000, 3)).astype(np.float32)
     tilted = np.array([0.0, 0.6, 0.8])
     box = Box(np.array([-0.5, -0.2, -0.9]), np.array([0.1, 0.7, 0.9]))
-    kept = cloud.crop(torch.from_numpy(points), ask(points, workspace=box, up=tilted, support_height=0.1)).numpy()
+    kept = cropped(points, ask(points, workspace=box, up=tilted, support_height=0.1))
     wanted = points[((points >= box.minimum) & (points <= box.maximum)).all(axis=1) & (points @ tilted >= 0.1 + 0.005)]
     np.testing.assert_array_equal(kept, wanted)
-    assert len(cloud.crop(torch.from_numpy(points), ask(points))) == len(points)
+    assert len(cropped(points, ask(points))) == len(points)
 
 
 def test_a_prepared_cloud_is_complete_and_consistent() -> None:

@@ -105,12 +105,6 @@ def turned(mesh: Mesh, angle: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) 
     return Mesh(mesh.vertices @ turn.T + np.asarray(offset), mesh.faces)
 
 
-def tipped(mesh: Mesh, angle: float) -> Mesh:
-    """A mesh turned about +y."""
-    turn = np.array([[np.cos(angle), 0.0, np.sin(angle)], [0.0, 1.0, 0.0], [-np.sin(angle), 0.0, np.cos(angle)]])
-    return Mesh(mesh.vertices @ turn.T, mesh.faces)
-
-
 def _across(direction: Array) -> tuple[Array, Array]:
     """Two unit vectors that make a right-handed frame with a direction."""
     along = direction / np.linalg.norm(direction)

@@ -18,10 +18,11 @@ from simharness.sim.execute import (
     label_strict,
     snapshot_of,
 )
-from simharness.sim.hand import MAX_WIDTH, Hand, Placement
+from simharness.sim.hand import Hand, Placement
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import TABLE_HEIGHT, restore_scene, settle
 from simharness.sim.world import BASE_LINK, World, data_path
+from tesnet.geometry import PANDA
 from tesnet.hands import HANDS, KnownHand
 
 pytestmark = pytest.mark.sim
@@ -69,7 +70,7 @@ def from_the_side(z: float = TABLE_HEIGHT + 0.025, downwards_deg: float = 10.0) 
 def test_a_good_grasp_lifts_and_removes_the_object(executor: str) -> None:
     with World() as world:
         hand, (cube, other) = scene(world, MIDDLE, (0.15, 0.25))
-        outcome = attempt(world, hand, from_above(), MAX_WIDTH, "strict" if executor == "strict" else "edge")
+        outcome = attempt(world, hand, from_above(), PANDA.max_width, "strict" if executor == "strict" else "edge")
         assert outcome == Outcome("success", (cube,), contact_at_start=False, contact_on_way=False)
         assert world.objects == (other,)
 
@@ -93,7 +94,7 @@ def test_a_contact_at_the_start_pose_is_noticed_by_the_strict_executor_only() ->
         with World() as world:
             hand, _ = scene(world, MIDDLE)
             world.add_static_box((0.02, 0.02, 0.02), (0.15, 0.2, 0.26), colour=(1.0, 1.0, 1.0, 1.0))
-            return attempt(world, hand, from_above(), MAX_WIDTH, "strict" if executor == "strict" else "edge")
+            return attempt(world, hand, from_above(), PANDA.max_width, "strict" if executor == "strict" else "edge")
 
     strict, edge = run("strict"), run("edge")
     assert strict.kind == "pregrasp"
@@ -108,12 +109,12 @@ def test_a_contact_on_the_way_fails_under_strict_and_pushes_under_edge() -> None
     # The left finger comes down onto the edge of a neighbour.
     with World() as world:
         hand, cubes = scene(world, MIDDLE, (0.15, 0.215))
-        outcome = attempt(world, hand, from_above(), MAX_WIDTH, "strict")
+        outcome = attempt(world, hand, from_above(), PANDA.max_width, "strict")
         assert outcome == Outcome("approach", (), contact_at_start=False, contact_on_way=True)
         assert world.objects == cubes
     with World() as world:
         hand, _ = scene(world, MIDDLE, (0.15, 0.215))
-        outcome = attempt(world, hand, from_above(), MAX_WIDTH, "edge")
+        outcome = attempt(world, hand, from_above(), PANDA.max_width, "edge")
         assert outcome.contact_on_way
         assert outcome.kind in ("success", "slip", "drop")
 
@@ -121,13 +122,13 @@ def test_a_contact_on_the_way_fails_under_strict_and_pushes_under_edge() -> None
 def test_the_table_counts_as_a_contact_on_the_way() -> None:
     with World() as world:
         hand, _ = scene(world, MIDDLE)
-        assert attempt(world, hand, from_above(z=TABLE_HEIGHT + 0.004), MAX_WIDTH, "strict").kind == "approach"
+        assert attempt(world, hand, from_above(z=TABLE_HEIGHT + 0.004), PANDA.max_width, "strict").kind == "approach"
 
 
 def test_closing_beside_everything_is_a_slip() -> None:
     with World() as world:
         hand, cubes = scene(world, MIDDLE)
-        outcome = attempt(world, hand, from_above(x=0.25), MAX_WIDTH, "strict")
+        outcome = attempt(world, hand, from_above(x=0.25), PANDA.max_width, "strict")
         assert outcome == Outcome("slip", (), contact_at_start=False, contact_on_way=False)
         assert world.objects == cubes
 
@@ -137,7 +138,7 @@ def test_an_object_too_heavy_to_lift_is_dropped() -> None:
         hand, (cube,) = scene(world, MIDDLE)
         world.set_dynamics(cube, BASE_LINK, mass=20.0)
         settle(world)
-        assert attempt(world, hand, from_above(), MAX_WIDTH, "strict").kind == "drop"
+        assert attempt(world, hand, from_above(), PANDA.max_width, "strict").kind == "drop"
         assert world.objects == (cube,)
 
 
@@ -145,7 +146,7 @@ def test_a_hand_that_comes_from_the_side_lifts_straight_up() -> None:
     # Backwards along z, the cube would be dragged into the block behind the hand's fingers, and stay on the table.
     with World() as world:
         hand, (cube,) = scene(world, MIDDLE)
-        outcome = attempt(world, hand, from_the_side(TABLE_HEIGHT + 0.045), MAX_WIDTH, "strict")
+        outcome = attempt(world, hand, from_the_side(TABLE_HEIGHT + 0.045), PANDA.max_width, "strict")
         assert outcome == Outcome("success", (cube,), contact_at_start=False, contact_on_way=False)
 
 
@@ -171,7 +172,7 @@ PAIR: Sequence[Place] = (MIDDLE, (0.15, 0.22))
 
 def test_labels_agree_with_attempts_and_do_not_depend_on_their_order() -> None:
     grasps = candidates(0, 12)
-    widths = np.full(len(grasps), MAX_WIDTH)
+    widths = np.full(len(grasps), PANDA.max_width)
     with World() as world:
         hand, cubes = scene(world, *PAIR)
         with snapshot_of(world) as snapshot:
@@ -184,14 +185,14 @@ def test_labels_agree_with_attempts_and_do_not_depend_on_their_order() -> None:
     for grasp in grasps:
         with World() as world:
             hand, _ = scene(world, *PAIR)
-            outcomes.append(attempt(world, hand, grasp, MAX_WIDTH, "strict").kind)
+            outcomes.append(attempt(world, hand, grasp, PANDA.max_width, "strict").kind)
     agreement = np.mean([label == outcome for label, outcome in zip(labels, outcomes, strict=True)])
     assert agreement > 0.9
 
 
 def test_labels_for_the_edge_executor_are_paid_for_on_request() -> None:
     grasps = candidates(1, 4)
-    widths = np.full(len(grasps), MAX_WIDTH)
+    widths = np.full(len(grasps), PANDA.max_width)
     with World() as world:
         hand, _ = scene(world, *PAIR)
         with snapshot_of(world) as snapshot:
@@ -208,7 +209,7 @@ def test_the_same_attempts_end_the_same_to_the_bit_in_a_fresh_world() -> None:
             hand, _ = scene(world, *PAIR, (0.1, 0.1))
             record: list[object] = []
             for grasp in candidates(2, 2):
-                record.append(attempt(world, hand, grasp, MAX_WIDTH, "edge"))
+                record.append(attempt(world, hand, grasp, PANDA.max_width, "edge"))
                 record += [world.pose(body).matrix.tobytes() for body in world.objects]
             return record
 
@@ -229,7 +230,7 @@ def test_an_object_at_one_finger_alone_is_lifted_by_edge_and_slips_from_strict()
         with World() as world:
             hand, _ = scene(world, (0.15, 0.165))
             world.add_static_box((0.005, 0.004, 0.02), (0.15, 0.138, TABLE_HEIGHT + 0.02), colour=(1.0, 1.0, 1.0, 1.0))
-            return attempt(world, hand, from_above(), MAX_WIDTH, executor)
+            return attempt(world, hand, from_above(), PANDA.max_width, executor)
 
     strict, edge = run("strict"), run("edge")
     assert strict.closed is not None
@@ -254,7 +255,9 @@ def test_hands_retreat_backwards_up_to_60_deg_from_straight_down_and_upwards_bey
     with World() as world:
         hand, _ = scene(world, MIDDLE)
         monkeypatch.setattr(Hand, "carry_to", told)
-        outcome = attempt(world, hand, from_the_side(TABLE_HEIGHT + 0.04, 90.0 - from_down_deg), MAX_WIDTH, "edge")
+        outcome = attempt(
+            world, hand, from_the_side(TABLE_HEIGHT + 0.04, 90.0 - from_down_deg), PANDA.max_width, "edge"
+        )
     assert outcome.closed is not None
     assert outcome.closed.touched
     assert asked[-1] == pytest.approx((0.0, RETREAT_DISTANCE) if upwards else (RETREAT_DISTANCE, 0.0))
@@ -264,7 +267,7 @@ def test_the_first_contact_is_told_whether_or_not_the_hand_goes_on() -> None:
     def run(executor: Executor) -> Outcome:
         with World() as world:
             hand, _ = scene(world, MIDDLE, (0.15, 0.215))
-            return attempt(world, hand, from_above(), MAX_WIDTH, executor)
+            return attempt(world, hand, from_above(), PANDA.max_width, executor)
 
     strict, edge = run("strict"), run("edge")
     assert strict.first_contact is not None
@@ -274,9 +277,9 @@ def test_the_first_contact_is_told_whether_or_not_the_hand_goes_on() -> None:
 def test_the_hand_is_far_away_after_an_attempt() -> None:
     with World() as world:
         hand, _ = scene(world, MIDDLE)
-        attempt(world, hand, from_above(), MAX_WIDTH, "strict")
+        attempt(world, hand, from_above(), PANDA.max_width, "strict")
         assert np.linalg.norm(hand.T_world_grasp.translation - [0.15, 0.15, TABLE_HEIGHT]) > 0.5
-        assert hand.width == pytest.approx(MAX_WIDTH, abs=1e-3)
+        assert hand.width == pytest.approx(PANDA.max_width, abs=1e-3)
 
 
 @pytest.mark.parametrize(("thickness", "empty"), [(0.012, False), (0.004, True)])
@@ -284,6 +287,6 @@ def test_fingers_hold_nothing_when_they_all_but_meet(thickness: float, empty: bo
     with World() as world:
         hand, _ = scene(world)
         world.add_static_box((0.02, thickness / 2, 0.03), (0.15, 0.15, TABLE_HEIGHT + 0.03), colour=(1, 1, 1, 1))
-        outcome = attempt(world, hand, from_above(z=TABLE_HEIGHT + 0.04), MAX_WIDTH, "strict")
+        outcome = attempt(world, hand, from_above(z=TABLE_HEIGHT + 0.04), PANDA.max_width, "strict")
         assert outcome.closed is not None
         assert outcome.closed.empty is empty

@@ -10,7 +10,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from simharness.sim.hand import FINGER_BASE, MAX_WIDTH, Hand
+from simharness.sim.hand import FINGER_BASE, Hand
 from simharness.sim.world import World, data_path
 from tesnet.geometry import PANDA, Pose
 from tesnet.hands import HANDS
@@ -46,7 +46,7 @@ def test_the_hand_is_placed_by_its_tcp(world: World) -> None:
 def test_the_fingertips_are_112_mm_from_the_hands_base(world: World) -> None:
     floor = world.add_static_box((0.5, 0.5, 0.05), (0.0, 0.0, -0.05), colour=(1.0, 1.0, 1.0, 1.0))
     hand = Hand(world)
-    hand.place(grasp(0.0, 0.0, 0.1).matrix, MAX_WIDTH)
+    hand.place(grasp(0.0, 0.0, 0.1).matrix, PANDA.max_width)
     gap = world.distance(hand.body, floor, limit=0.2)
     assert gap is not None
     base_height = 0.1 + PANDA.hand_to_tcp
@@ -94,7 +94,7 @@ def test_the_pads_stand_half_the_width_to_either_side_along_y(world: World, widt
 def test_closing_on_a_box_leaves_its_thickness_as_opening(world: World, thickness: float) -> None:
     world.add_static_box((0.03, thickness / 2, 0.03), (0.0, 0.0, 0.0), colour=(1.0, 1.0, 1.0, 1.0))
     hand = Hand(world)
-    hand.place(grasp(0.0, 0.0, 0.02).matrix, MAX_WIDTH)
+    hand.place(grasp(0.0, 0.0, 0.02).matrix, PANDA.max_width)
     world.find_contacts()
     assert not hand.touches_anything()
     hand.close()
@@ -105,7 +105,7 @@ def test_closing_on_a_box_leaves_its_thickness_as_opening(world: World, thicknes
 
 def test_a_hand_that_closes_on_nothing_meets_itself_only(world: World) -> None:
     hand = Hand(world)
-    hand.place(grasp(0.0, 0.0, 0.3).matrix, MAX_WIDTH)
+    hand.place(grasp(0.0, 0.0, 0.3).matrix, PANDA.max_width)
     hand.close()
     world.step(120)
     assert hand.width == pytest.approx(0.0, abs=0.001)
@@ -115,17 +115,17 @@ def test_a_hand_that_closes_on_nothing_meets_itself_only(world: World) -> None:
 def test_the_constraint_carries_the_hand_and_gravity_does_not(world: World) -> None:
     hand = Hand(world)
     start = grasp(0.1, 0.1, 0.3)
-    hand.place(start.matrix, MAX_WIDTH)
-    hand.hold_open(MAX_WIDTH)
+    hand.place(start.matrix, PANDA.max_width)
+    hand.hold_open(PANDA.max_width)
     world.step(120)
     np.testing.assert_allclose(hand.T_world_grasp.matrix, start.matrix, atol=1e-4)
-    assert hand.width == pytest.approx(MAX_WIDTH, abs=1e-4)
+    assert hand.width == pytest.approx(PANDA.max_width, abs=1e-4)
 
 
 @pytest.mark.parametrize("deep", [0, 1])
 def test_the_deepest_contact_is_the_deepest_whichever_was_found_first(world: World, deep: int) -> None:
     hand = Hand(world)
-    hand.place(grasp(0.0, 0.0, 0.2).matrix, MAX_WIDTH)  # turned over, so that its left finger is at negative y
+    hand.place(grasp(0.0, 0.0, 0.2).matrix, PANDA.max_width)  # turned over, so that its left finger is at negative y
     tip = 0.2 - 0.112 + PANDA.hand_to_tcp
     depths = [0.006 if finger == deep else 0.002 for finger in (0, 1)]
     plates = [
@@ -152,7 +152,7 @@ def test_a_finger_that_moves_is_not_overlooked_for_one_that_stands(
 
 def test_what_the_palm_alone_touches_is_touched_and_not_pinched(world: World) -> None:
     hand = Hand(world)
-    hand.place(grasp(0.0, 0.0, 0.2).matrix, MAX_WIDTH)
+    hand.place(grasp(0.0, 0.0, 0.2).matrix, PANDA.max_width)
     palm = 0.2 + PANDA.hand_to_tcp - 0.03
     block = world.add_static_box((0.01, 0.01, 0.01), (0.0, 0.0, palm), colour=(1, 1, 1, 1))
     world.find_contacts()

@@ -6,7 +6,17 @@ import numpy as np
 import pytest
 
 from simharness.sim.procedural import FAMILIES, OBJECTS_PER_FAMILY, generate_object, object_names
-from simharness.sim.solids import GeneratedObject, Mesh
+from simharness.sim.solids import GeneratedObject
+from tests.simharness.sim.meshes import (
+    assert_centred_on_its_mass,
+    assert_closed_and_turned_outwards,
+    assert_parts_are_convex,
+    assert_seen_is_touched,
+    assert_stands,
+    corners_of,
+    parts_of,
+    shells_of,
+)
 
 NAMES = [*object_names("test"), *(name for name in object_names("train") if name.endswith(("_00", "_05")))]
 
@@ -16,61 +26,29 @@ def objects() -> list[GeneratedObject]:
     return [generate_object(name) for name in NAMES]
 
 
-def parts_of(generated: GeneratedObject) -> list[Mesh]:
-    return [part for body in generated.bodies for part in body.parts]
-
-
-def shells_of(generated: GeneratedObject) -> list[Mesh]:
-    return [shell for body in generated.bodies for shell in body.shells]
-
-
-def corners_of(meshes: list[Mesh]) -> np.ndarray:
-    return np.concatenate([mesh.vertices for mesh in meshes])
-
-
 def test_every_mesh_is_closed_and_turned_outwards(objects: list[GeneratedObject]) -> None:
     for generated in objects:
-        for mesh in (*parts_of(generated), *shells_of(generated)):
-            starts, ends = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-            edges, back = starts * len(mesh.vertices) + ends, ends * len(mesh.vertices) + starts
-            assert len(np.unique(edges)) == len(edges), generated.name
-            assert np.array_equal(np.sort(edges), np.sort(back)), generated.name
-            assert mesh.volume > 0, generated.name
+        assert_closed_and_turned_outwards(generated)
 
 
 def test_every_collision_part_is_convex(objects: list[GeneratedObject]) -> None:
     for generated in objects:
-        for part in parts_of(generated):
-            a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
-            normals = np.cross(b - a, c - a)
-            lengths = np.linalg.norm(normals, axis=1)
-            normals, points = normals[lengths > 1e-12] / lengths[lengths > 1e-12, None], a[lengths > 1e-12]
-            outside = np.einsum("fi,vfi->vf", normals, part.vertices[:, None] - points)
-            assert outside.max() < 1e-5, generated.name
+        assert_parts_are_convex(generated, within=1e-5)
 
 
 def test_what_is_seen_is_what_is_touched(objects: list[GeneratedObject]) -> None:
     for generated in objects:
-        seen, touched = corners_of(shells_of(generated)), corners_of(parts_of(generated))
-        np.testing.assert_allclose(seen.min(axis=0), touched.min(axis=0), atol=1e-3, err_msg=generated.name)
-        np.testing.assert_allclose(seen.max(axis=0), touched.max(axis=0), atol=1e-3, err_msg=generated.name)
+        assert_seen_is_touched(generated, within=1e-3)
 
 
 def test_the_origin_is_the_centre_of_mass(objects: list[GeneratedObject]) -> None:
     for generated in objects:
-        weights = [part.volume * body.density for body in generated.bodies for part in body.parts]
-        centre = np.average([part.centroid for part in parts_of(generated)], axis=0, weights=weights)
-        np.testing.assert_allclose(centre, 0, atol=1e-9, err_msg=generated.name)
+        assert_centred_on_its_mass(generated)
 
 
 def test_an_object_stands_until_it_is_tilted_by_eight_degrees(objects: list[GeneratedObject]) -> None:
     for generated in objects:
-        corners = corners_of(parts_of(generated))
-        lowest = corners[:, 2].min()
-        foot = corners[corners[:, 2] < lowest + 2e-4, :2]
-        directions = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-        reach = (foot @ np.stack([np.cos(directions), np.sin(directions)])).max(axis=0).min()
-        assert np.degrees(np.arctan2(reach, -lowest)) > 8, generated.name
+        assert_stands(generated, foot_within=2e-4)
 
 
 def test_sizes_are_those_of_household_objects(objects: list[GeneratedObject]) -> None:

@@ -8,7 +8,7 @@ from simharness.sim import procedural
 from simharness.sim.shapes.sets import SETS
 from simharness.sim.solids import GeneratedObject
 from tesnet.geometry import PANDA
-from tests.simharness.sim.shapes.meshes import corners_of
+from tests.simharness.sim.meshes import corners_of, parts_of
 
 VALIDATION = ("flat", "novel", "wide")
 
@@ -27,7 +27,7 @@ def test_validation_families_are_in_no_training_set() -> None:
 def test_most_novel_shapes_are_wider_than_the_hand_and_none_leaves_the_workspace(
     made: dict[str, list[GeneratedObject]],
 ) -> None:
-    extents = np.array([np.sort(np.ptp(corners_of(generated), axis=0)) for generated in made["novel"]])
+    extents = np.array([np.sort(np.ptp(corners_of(parts_of(generated)), axis=0)) for generated in made["novel"]])
     assert np.mean(extents[:, 1] > PANDA.max_width) > 0.8
     assert extents[:, 2].max() < 0.18
 
@@ -36,7 +36,7 @@ def test_a_spool_is_narrow_between_its_flanges(made: dict[str, list[GeneratedObj
     for generated in made["novel"]:
         if "/spool_" not in generated.name:
             continue
-        corners = corners_of(generated)
+        corners = corners_of(parts_of(generated))
         levels = np.unique(corners[:, 2].round(6))
         across = [
             np.linalg.norm(corners[np.isclose(corners[:, 2], level, atol=1e-5), :2], axis=1).max() for level in levels

@@ -10,7 +10,14 @@ import pytest
 from simharness.sim.objects import load_object_set
 from simharness.sim.shapes.sets import SETS
 from simharness.sim.solids import GeneratedObject
-from tests.simharness.sim.shapes.meshes import corners_of, meshes_of, parts_of
+from tests.simharness.sim.meshes import (
+    assert_centred_on_its_mass,
+    assert_closed_and_turned_outwards,
+    assert_parts_are_convex,
+    assert_seen_is_touched,
+    assert_stands,
+    meshes_of,
+)
 
 VALIDATION = ("flat", "novel", "wide")
 
@@ -26,24 +33,13 @@ SHAPES = {
 @pytest.mark.parametrize("name", SETS)
 def test_every_mesh_is_closed_and_turned_outwards(name: str, made: dict[str, list[GeneratedObject]]) -> None:
     for generated in made[name]:
-        for mesh in meshes_of(generated):
-            starts, ends = mesh.faces.ravel(), np.roll(mesh.faces, -1, axis=1).ravel()
-            edges, back = starts * len(mesh.vertices) + ends, ends * len(mesh.vertices) + starts
-            assert len(np.unique(edges)) == len(edges), generated.name
-            assert np.array_equal(np.sort(edges), np.sort(back)), generated.name
-            assert mesh.volume > 0, generated.name
+        assert_closed_and_turned_outwards(generated)
 
 
 @pytest.mark.parametrize("name", SETS)
 def test_every_part_is_convex_to_a_third_of_a_millimetre(name: str, made: dict[str, list[GeneratedObject]]) -> None:
     for generated in made[name]:
-        for part in parts_of(generated):
-            a, b, c = np.moveaxis(part.vertices[part.faces], 1, 0)
-            normals = np.cross(b - a, c - a)
-            lengths = np.linalg.norm(normals, axis=1)
-            normals, points = normals[lengths > 1e-12] / lengths[lengths > 1e-12, None], a[lengths > 1e-12]
-            outside = np.einsum("fi,vfi->vf", normals, part.vertices[:, None] - points)
-            assert outside.max() < 3e-4, generated.name
+        assert_parts_are_convex(generated, within=3e-4)
 
 
 @pytest.mark.parametrize("name", SETS)
@@ -51,24 +47,14 @@ def test_what_is_seen_is_what_is_touched_and_the_origin_is_the_centre_of_mass(
     name: str, made: dict[str, list[GeneratedObject]]
 ) -> None:
     for generated in made[name]:
-        seen = np.concatenate([shell.vertices for body in generated.bodies for shell in body.shells])
-        touched = corners_of(generated)
-        np.testing.assert_allclose(seen.min(axis=0), touched.min(axis=0), atol=1e-6, err_msg=generated.name)
-        np.testing.assert_allclose(seen.max(axis=0), touched.max(axis=0), atol=1e-6, err_msg=generated.name)
-        weights = [part.volume * body.density for body in generated.bodies for part in body.parts]
-        centre = np.average([part.centroid for part in parts_of(generated)], axis=0, weights=weights)
-        np.testing.assert_allclose(centre, 0, atol=1e-9, err_msg=generated.name)
+        assert_seen_is_touched(generated, within=1e-6)
+        assert_centred_on_its_mass(generated)
 
 
 @pytest.mark.parametrize("name", VALIDATION)
 def test_a_shape_stands_until_it_is_tilted_by_eight_degrees(name: str, made: dict[str, list[GeneratedObject]]) -> None:
     for generated in made[name]:
-        corners = corners_of(generated)
-        lowest = corners[:, 2].min()
-        foot = corners[corners[:, 2] < lowest + 3e-4, :2]
-        directions = np.linspace(0, 2 * np.pi, 72, endpoint=False)
-        reach = (foot @ np.stack([np.cos(directions), np.sin(directions)])).max(axis=0).min()
-        assert np.degrees(np.arctan2(reach, -lowest)) > 8, generated.name
+        assert_stands(generated, foot_within=3e-4)
 
 
 @pytest.mark.parametrize("name", SETS)
