@@ -13,10 +13,11 @@ from hypothesis import strategies as st
 
 from tesnet import candidates, cloud, collision
 from tesnet.candidates import CandidateConfig, Candidates
-from tesnet.geometry import PANDA
+from tesnet.geometry import PANDA, Gripper, Pose
 from tesnet.hands import HANDS
 from tesnet.outline import Outline, outline
 from tesnet.query import ApproachCone
+from tests.tesnet.hand_twin import HANDS_TO_TRY, depth_in_hand
 from tests.tesnet.raycast import Bowl, Slab, overhead_query
 from tests.tesnet.scenes import (
     CAMERA,
@@ -166,6 +167,34 @@ def test_hand_clearance_is_that_of_the_lowest_corner() -> None:
     clearance = exact(candidates.hand_clearance(ready(), found.Ts_canonical_grasp, PANDA, found.widths))
     np.testing.assert_allclose(clearance, lowest_corner(ready(), found), atol=ROUNDING)
     assert clearance.min() < 0 < clearance.max()
+
+
+@pytest.mark.parametrize("name", HANDS_TO_TRY)
+def test_no_part_of_a_hand_comes_lower_than_its_clearance(name: str) -> None:
+    """By places drawn in the twin of the hand: the lowest of them is a little higher than the lowest corner."""
+    hand = HANDS_TO_TRY[name].with_sizes({"finger_tip_breadth": HANDS_TO_TRY[name].finger_breadth})
+    rng = np.random.default_rng(4)
+    places = rng.uniform(-1, 1, (400_000, 3)) * [0.09, 0.16, 0.1] - [0.0, 0.0, 0.09]
+    inside = places[depth_in_hand(places, np.eye(4), hand, hand.max_width) > 0]
+    up = np.array([0.48, -0.6, 0.64])
+    cloud_ = bare_cloud(rng.uniform(-0.1, 0.1, (50, 3)), up=torch.tensor(up).float(), support_height=-0.3)
+    Ts = np.array([Pose.random(rng, reach=0.1).matrix for _ in range(30)])
+    clearance = exact(candidates.hand_clearance(cloud_, torch.from_numpy(Ts).float(), hand))
+    lowest = np.array([(inside @ T[:3, :3].T @ up).min() + T[:3, 3] @ up + 0.3 for T in Ts])
+    assert (lowest >= clearance - ROUNDING).all()
+    np.testing.assert_allclose(lowest, clearance, atol=0.012)
+
+
+@pytest.mark.parametrize("hand", [*HANDS_TO_TRY.values(), *(known.gripper for known in HANDS.values())])
+def test_limits_follow_half_the_opening_and_the_depth_of_the_fingers(hand: Gripper) -> None:
+    """Each fingertip has half of the opening, and leaves the Panda's margins within it."""
+    limits = candidates.limits_for(hand, CONFIG)
+    assert hand.max_width / 2 - limits.max_offset == pytest.approx(0.08 / 2 - CONFIG.max_offset)
+    assert hand.finger_depth - limits.max_depth == pytest.approx(PANDA.finger_depth - CONFIG.max_depth)
+    farther = max(limits.max_offset - CONFIG.max_offset, limits.max_depth - CONFIG.max_depth, 0.0)
+    assert limits.max_pair_distance == pytest.approx(CONFIG.max_pair_distance + farther)
+    kept = ("min_depth", "min_offset", "max_upward", "support_clearance", "levelled_within_deg")
+    assert all(getattr(limits, field) == getattr(CONFIG, field) for field in kept)
 
 
 def test_without_a_support_nothing_is_too_low() -> None:
@@ -328,6 +357,69 @@ def test_hands_come_straight_down_on_low_things(height: float) -> None:
     np.testing.assert_allclose(tips, lowest, atol=2e-5)
     assert (lowest_corner(flat, low) >= CONFIG.support_clearance - 1e-6).all()
     assert (approach - tips >= 0.005 - 2e-5).all()
+
+
+def card(options: dict[str, Any] | None = None) -> tuple[cloud.PreparedCloud, Candidates]:
+    """A box so low that all pairs on it are shallow, few enough points to try each, and the candidates on it."""
+    points, normals = box_surface((0.05, 0.07, 0.0125), 60_000, np.random.default_rng(0))
+    seen = seen_from(points + 0.00625 * UP, normals, CAMERA)
+    given = {"viewpoints": CAMERA, "up": UP, "support_height": 0.0, "num_approach_points": 1024}
+    query = ask(seen, **{**given, "max_candidates": 20_000, **(options or {})})
+    flat = prepared(query, voxel_size=0.006)
+    assert len(flat) < 1024
+    return flat, candidates.generate(flat, query, CONFIG)[0]
+
+
+@pytest.mark.parametrize("hand", [PANDA, HANDS["hand_e"].gripper, PANDA.with_sizes({"max_width": 0.05})])
+@pytest.mark.parametrize("cone", [None, ApproachCone(-UP, 20.0), ApproachCone(UP, 20.0)])
+def test_shallow_pairs_are_those_of_a_double_loop(hand: Gripper, cone: ApproachCone | None) -> None:
+    """Pairs less deep than `min_depth`, closing level along the wall's normal and coming straight down, in float64."""
+    flat, found = card({"gripper": hand, "approach": cone})
+    assert flat.up is not None
+    assert flat.support_height is not None
+    up, points, normals = exact(flat.up), exact(flat.points), exact(flat.normals)
+    limits = candidates.limits_for(hand, CONFIG)
+    rise = normals @ up
+    level = normals - rise[:, None] * up
+    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    certain, possible = {}, {}
+    for c in np.flatnonzero(np.abs(rise) < 0.95):
+        d = points[c] - points
+        depth, along = -(d @ up), d @ level[c]
+        aside = np.sqrt(np.clip((d**2).sum(axis=1) - depth**2 - along**2, 0, None))
+        margins = [
+            limits.max_pair_distance - np.linalg.norm(d, axis=1), depth, limits.min_depth - depth,
+            along - limits.min_offset, limits.max_offset - along, 0.005 - aside,
+        ]  # fmt: skip
+        least = np.min(margins, axis=0)
+        # Tips 7 mm past the contact point, or as far as the support lets them, if that is 5 mm past the approach point.
+        top = points @ up - flat.support_height
+        tips = np.maximum(top - depth - 0.007, CONFIG.support_clearance)
+        reach = np.minimum(top - tips - 0.005, 0.001)
+        certain |= {(a, int(c)): tips[a] for a in np.flatnonzero(np.minimum(least, reach) > 1e-4)}
+        possible |= {(a, int(c)): tips[a] for a in np.flatnonzero(np.minimum(least, reach) > -1e-4)}
+    straight = exact(found.Ts_canonical_grasp[:, :3, 2]) @ up < -0.9999
+    shallow = found.select(torch.from_numpy(straight))
+    if cone is not None and cone.direction[2] > 0:
+        assert len(shallow) == 0
+        return
+    pairs = list(zip(shallow.approach.tolist(), shallow.contact.tolist(), strict=True))
+    assert len(certain) > 50
+    assert set(certain) <= set(pairs) <= set(possible)
+    tips = exact(shallow.Ts_canonical_grasp[:, :3, 3]) @ up - flat.support_height - hand.tip_offset
+    np.testing.assert_allclose(tips, [possible[pair] for pair in pairs], atol=2e-4)
+    closing = exact(shallow.Ts_canonical_grasp[:, :3, 1])
+    np.testing.assert_allclose(closing, level[shallow.contact.numpy()], atol=1e-4)
+
+
+def test_shallow_pairs_are_added_for_want_of_others_alone() -> None:
+    flat, few = card()
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(candidates, "_low_walls", lambda *_: pytest.fail("there are others"))
+        generate({"num_approach_points": 64})
+    deep = exact((flat.points[few.contact] - flat.points[few.approach]).norm(dim=1))
+    assert len(few) > 50
+    assert deep.min() < CONFIG.max_pair_distance
 
 
 def test_a_thing_too_low_for_the_tips_has_no_candidates() -> None:

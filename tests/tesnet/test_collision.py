@@ -1,5 +1,7 @@
 from __future__ import annotations
 
+from dataclasses import replace
+
 import numpy as np
 import pytest
 import torch
@@ -7,7 +9,10 @@ from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from tesnet import candidates, collision
-from tesnet.geometry import PANDA, Pose
+from tesnet.cloud import PreparedCloud
+from tesnet.geometry import PANDA, Gripper, Pose
+from tesnet.obstacles import Obstacles
+from tests.tesnet.hand_twin import HANDS_TO_TRY, deepest_on_way
 from tests.tesnet.scenes import Array, bare_cloud, open_hands, prepared, tabletop_query
 
 ROUNDING = 1e-6
@@ -205,3 +210,100 @@ def test_the_shadow_moves_with_the_scene(turn: int) -> None:
 @pytest.mark.parametrize("viewpoint", [[0.0, 0.0, 0.0], [0.0, 0.0, 1e6]])
 def test_a_viewpoint_inside_the_cloud_or_far_away_is_no_trouble(viewpoint: list[float]) -> None:
     assert len(shadowed([0.0, 0.0, -0.1], viewpoints=np.array([viewpoint]))) == 1
+
+
+# Every part of the judgement goes by the hand that was asked for and by the opening of each candidate
+
+
+@pytest.fixture(params=HANDS_TO_TRY)
+def hand(request: pytest.FixtureRequest) -> Gripper:
+    found: Gripper = HANDS_TO_TRY[request.param]
+    return found
+
+
+def scattered(seed: int, hand: Gripper, poses: int = 40) -> tuple[Array, Array, Array]:
+    """Four points, poses about them, and openings of the hand from nearly closed to wide."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-0.15, 0.15, (4, 3)).astype(np.float32).astype(np.float64)
+    Ts = np.array([Pose.random(rng, reach=0.15).matrix for _ in range(poses)])
+    return points, Ts, rng.uniform(0.1, 1.0, poses) * hand.max_width
+
+
+def opened(Ts: Array, widths: Array) -> candidates.Candidates:
+    """Hands at poses (C, 4, 4), open by widths (C,)."""
+    return replace(open_hands(torch.from_numpy(Ts).float()), widths=torch.from_numpy(widths).float())
+
+
+def judged(cloud: PreparedCloud, Ts: Array, widths: Array, hand: Gripper) -> Array:
+    found: Array = collision.blocked(cloud, opened(Ts, widths), hand, "free").numpy()
+    return found
+
+
+NOWHERE = np.full((20, 3), 5.0)
+"""Far from every hand."""
+
+
+def test_the_hand_that_is_asked_for_meets_the_cloud_as_its_twin_does(hand: Gripper) -> None:
+    points, Ts, widths = scattered(0, hand)
+    found = judged(bare_cloud(np.concatenate([points, NOWHERE])), Ts, widths, hand)
+    assert_agree(found, deepest_on_way(points, Ts, hand, widths, SWEEP))
+    assert 0 < found.sum() < len(found)
+
+
+def test_the_hand_that_is_asked_for_meets_what_was_not_sought_as_its_twin_does(hand: Gripper) -> None:
+    points, Ts, widths = scattered(1, hand)
+    unsought = Obstacles.of(torch.from_numpy(points).float())
+    found = judged(bare_cloud(NOWHERE, unsought=unsought), Ts, widths, hand)
+    assert_agree(found, deepest_on_way(points, Ts, hand, widths, SWEEP))
+    assert 0 < found.sum() < len(found)
+
+
+@pytest.mark.parametrize("sign", [1.0, -1.0])
+def test_the_hand_that_is_asked_for_meets_what_a_side_cuts_off_as_its_twin_does(hand: Gripper, sign: float) -> None:
+    """On the side of the workspace where the strip is, whichever of the two that is."""
+    turn = np.array([1.0, sign, 1.0])
+    sides = torch.tensor([[0.0, sign, 0.0, 0.1005], [0.0, -sign, 0.0, 0.1005]])
+    further = np.array([(x, y + step, 0.0) for x, y, _ in STRIP for step in np.arange(0.005, 0.04, 0.005)])
+    _, Ts, widths = scattered(2, hand, poses=150)
+    Ts[:, :3, 3] += turn * [0.0, 0.12, 0.0]
+    strip, guessed = (deepest_on_way(points * turn, Ts, hand, widths, SWEEP) for points in (STRIP, further))
+    cloud = bare_cloud(STRIP * turn, sides=sides)
+    found = judged(cloud, Ts, widths, hand)
+    assert_agree(found, np.maximum(strip, guessed))
+    assert not found.all()
+    only_guessed = (strip < -0.001) & (guessed > ROUNDING)
+    assert only_guessed.any()
+    assert not judged(cloud, Ts[only_guessed], widths[only_guessed], hand).any(), "a guess leaves a candidate"
+
+
+def test_a_guess_that_would_leave_nothing_beside_what_is_seen_counts_for_none() -> None:
+    """One hand meets the strip, the other only what may stand beyond it: together nothing would be left."""
+    assert blocked_beside_the_side(0.05, 0.07) == [True, False]
+    assert blocked_beside_the_side(0.05, 0.07, -0.2) == [True, True, False]
+
+
+@pytest.mark.parametrize("part", ["left", "right", "palm"])
+@pytest.mark.parametrize("end", [-1.0, 1.0])
+@pytest.mark.parametrize("share", [0.4, 1.0])
+def test_each_part_of_the_hand_that_is_asked_for_is_looked_for_in_the_shadow(
+    hand: Gripper, part: str, end: float, share: float
+) -> None:
+    """The shadow of a small square covers one part alone: a finger's tip or its back, or an end of the palm."""
+    width = share * hand.max_width
+    beside = width / 2 + hand.finger_tip_thickness / 2
+    tip, back = hand.tip_offset, hand.palm_front
+    depth = tip - 0.003 if end > 0 else back + 0.003
+    of_palm = [0.0, end * 0.45 * hand.palm_length, back - 0.005]
+    place = {"left": [0.0, beside, depth], "right": [0.0, -beside, depth], "palm": of_palm}[part]
+    T = HAND_ALONG_X.copy()
+    T[:3, 3] = -T[:3, :3] @ place
+    aside = T.copy()
+    aside[1, 3] += 1.0
+    along = np.arange(-0.02, 0.0201, 0.002)
+    square = np.stack([*np.meshgrid(along, along), np.full((len(along), len(along)), 0.03)], axis=2).reshape(-1, 3)
+    cloud = bare_cloud(square, np.array([[0.0, 0.0, 3.0]]))
+    hands = opened(np.stack([T, aside]), np.array([width, width]))
+    alone = collision.blocked(cloud, hands.select(torch.tensor([1])), hand, "free")
+    assert alone.tolist() == [False]
+    assert collision.in_shadow(cloud, hands.Ts_canonical_grasp, hand, hands.widths).tolist() == [True, False]
+    assert collision.blocked(cloud, hands, hand, "occupied").tolist() == [True, False]
