@@ -14,7 +14,7 @@ import pytest
 
 from service import batching
 from service.batching import PredictionWorker
-from service.cost import REMEMBERED_S
+from service.cost import REMEMBERED_S, Costs
 from service.errors import DeadlineExceeded, NotReady, QueueFull
 from tesnet.errors import GaveUp
 from tesnet.query import GraspQuery
@@ -298,6 +298,43 @@ def test_whoever_hears_of_an_answer_finds_the_predictor_free(timed: tuple[Timed,
             job.future.result(PATIENCE_S)
         assert worker.expected_wait == 0
     assert waits == [0.0] * 200
+
+
+def test_what_is_known_of_times_is_looked_at_and_learnt_under_the_lock(
+    start: StartWorker, made: list[Echo], query: GraspQuery, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    workers: list[PredictionWorker] = []
+    seen: dict[str, list[bool]] = {"expected": [], "learn": []}
+
+    def note(name: str) -> None:
+        """Whether another thread could take the lock now."""
+
+        def attempt() -> None:
+            free = workers[0]._changed.acquire(blocking=False)
+            if free:
+                workers[0]._changed.release()
+            seen[name].append(free)
+
+        other = threading.Thread(target=attempt)
+        other.start()
+        other.join(PATIENCE_S)
+
+    class Watched(Costs):
+        def expected(self, query: GraspQuery, now: float) -> float:
+            note("expected")
+            return super().expected(query, now)
+
+        def learn(self, queries: Sequence[GraspQuery], seconds: float, now: float) -> None:
+            note("learn")
+            super().learn(queries, seconds, now)
+
+    monkeypatch.setattr(batching, "Costs", Watched)
+    workers.append(start(capacity=2))
+    made[0].gate.set()
+    workers[0].submit(query).future.result(PATIENCE_S)
+    for name, free in seen.items():
+        assert free, name
+        assert not any(free), name
 
 
 def test_a_refusal_changes_nothing_that_was_learnt(busy: tuple[Timed, PredictionWorker]) -> None:

@@ -14,6 +14,7 @@ import httpx
 import pytest
 
 from service import payloads
+from service.batching import PredictionWorker
 from service.grasps import SMALL_BODY
 from tests.conftest import PATIENCE_S
 from tests.service.wire import OCTETS, POINTS, connect, post, post_head, status_of
@@ -111,6 +112,30 @@ def test_requests_that_wait_are_predicted_together(
 
 def test_the_default_deadline_is_a_setting(serve: Serve) -> None:
     assert post(serve(request_timeout=0.2).url).status_code == 504
+
+
+def test_both_time_outs_of_a_request_count_from_its_arrival(serve: Serve, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Not from when its body had come or was decoded: then they would lie less than 90 s apart, or more."""
+    times: list[tuple[float, float]] = []
+    submit = PredictionWorker.submit
+
+    def noted(worker: PredictionWorker, query: Any, deadline: float, begin_by: float, client: Any) -> Any:
+        times.append((deadline, begin_by))
+        return submit(worker, query, deadline, begin_by, client)
+
+    monkeypatch.setattr(PredictionWorker, "submit", noted)
+    server = serve()
+    server.predictor.gate.set()
+    points = {"name": "points", "datatype": "FP32", "shape": [2, 3], "data": [0.0] * 6}
+    answer = httpx.post(
+        f"{server.url}/v2/models/tesnet/infer",
+        json={"inputs": [points], "parameters": {"timeout": 200_000_000}},
+        headers={"X-Request-Timeout": "290"},
+        timeout=PATIENCE_S,
+    )
+    assert answer.status_code == 200
+    ((deadline, begin_by),) = times
+    assert deadline - begin_by == pytest.approx(90, abs=1e-7)
 
 
 def test_a_body_that_does_not_arrive_in_time_is_a_504(serve: Serve) -> None:

@@ -42,6 +42,22 @@ def test_whoever_is_passed_for_as_long_as_it_would_have_taken_is_due() -> None:
     assert passed == 10  # 2 s that it would have waited, and 8 s of its own
 
 
+def test_whoever_is_due_is_ahead_of_a_cheaper_one_and_others_that_are_dearer_are_not() -> None:
+    turns = Turns(places=8)
+    turns.add(job(8.0, deadline=8.0), busy=0.0)  # nothing to spare: due from the start
+    turns.add(job(4.0), busy=0.0)
+    turns.add(job(1.0), busy=0.0)
+    cheap = job(1.0)
+    ahead = turns.ahead_of(cheap)
+    turns.add(cheap, busy=0.0)
+    before = []
+    while (taken := turns.take()) is not cheap:
+        assert taken is not None
+        before.append(taken.expected)
+    assert before == [8.0, 1.0]
+    assert ahead == sum(before)
+
+
 def test_a_deadline_leaves_less_to_spare() -> None:
     turns = Turns(places=8)
     dear = job(8.0, deadline=13.0)
