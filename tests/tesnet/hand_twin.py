@@ -21,10 +21,9 @@ HANDS_TO_TRY: dict[str, Gripper] = {
 """Hands that sweep other volumes than the Panda's, by sizes and by name; their tips slide straight."""
 
 
-def depth_in_hand(points: Array, T: Array, hand: Gripper, width: float) -> Array:
-    """(P,) how deep, in metres, points (P, 3) lie in the hand at rest at a pose (4, 4); negative outside."""
-    local = (points - T[:3, 3]) @ T[:3, :3]
-    x, y, z = np.abs(local[:, 0]), np.abs(local[:, 1]), local[:, 2]
+def depth_in_hand(places: Array, hand: Gripper, width: float) -> Array:
+    """(...) how deep, in metres, places (..., 3) of the grasp frame lie in the hand at rest; negative outside."""
+    x, y, z = np.abs(places[..., 0]), np.abs(places[..., 1]), places[..., 2]
     front, palm = hand.tip_offset, hand.tip_offset - (hand.finger_depth - PALM_OVERLAP)
     taper, end = max(hand.finger_taper, 1e-9), hand.finger_tip_thickness
     thickness = np.interp(front - z, [0, taper], [end, hand.finger_thickness])
@@ -37,11 +36,10 @@ def depth_in_hand(points: Array, T: Array, hand: Gripper, width: float) -> Array
 
 
 def deepest_on_way(points: Array, Ts: Array, hand: Gripper, widths: Array, sweep: float) -> Array:
-    """(C,) of the deepest point at any step, a millimetre apart, of the straight way to each pose, open by `widths`."""
-    deepest = np.full(len(Ts), -np.inf)
-    for row, (T, width) in enumerate(zip(Ts, widths, strict=True)):
-        for back in np.linspace(0, sweep, 1 + round(1000 * sweep)):
-            behind = T.copy()
-            behind[:3, 3] -= back * T[:3, 2]
-            deepest[row] = max(deepest[row], depth_in_hand(points, behind, hand, width).max())
-    return deepest
+    """(C,) of the deepest of the points (P, 3) at any step, a millimetre apart, of the straight way to each pose.
+
+    The hand at pose (4, 4) is open by its entry of `widths` (C,) all the way, which is `sweep` metres long.
+    """
+    steps = np.linspace(0, sweep, 1 + round(1000 * sweep))[:, None, None] * np.array([0.0, 0.0, 1.0])
+    places = ((points - T[:3, 3]) @ T[:3, :3] + steps for T in Ts)
+    return np.array([depth_in_hand(*of_hand).max() for of_hand in zip(places, [hand] * len(Ts), widths, strict=True)])

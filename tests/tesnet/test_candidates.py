@@ -175,7 +175,7 @@ def test_no_part_of_a_hand_comes_lower_than_its_clearance(name: str) -> None:
     hand = HANDS_TO_TRY[name].with_sizes({"finger_tip_breadth": HANDS_TO_TRY[name].finger_breadth})
     rng = np.random.default_rng(4)
     places = rng.uniform(-1, 1, (400_000, 3)) * [0.09, 0.16, 0.1] - [0.0, 0.0, 0.09]
-    inside = places[depth_in_hand(places, np.eye(4), hand, hand.max_width) > 0]
+    inside = places[depth_in_hand(places, hand, hand.max_width) > 0]
     up = np.array([0.48, -0.6, 0.64])
     cloud_ = bare_cloud(rng.uniform(-0.1, 0.1, (50, 3)), up=torch.tensor(up).float(), support_height=-0.3)
     Ts = np.array([Pose.random(rng, reach=0.1).matrix for _ in range(30)])
@@ -381,7 +381,7 @@ def test_shallow_pairs_are_those_of_a_double_loop(hand: Gripper, cone: ApproachC
     limits = candidates.limits_for(hand, CONFIG)
     rise = normals @ up
     level = normals - rise[:, None] * up
-    level /= np.linalg.norm(level, axis=1, keepdims=True)
+    level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12)
     certain, possible = {}, {}
     for c in np.flatnonzero(np.abs(rise) < 0.95):
         d = points[c] - points
@@ -412,14 +412,10 @@ def test_shallow_pairs_are_those_of_a_double_loop(hand: Gripper, cone: ApproachC
     np.testing.assert_allclose(closing, level[shallow.contact.numpy()], atol=1e-4)
 
 
-def test_shallow_pairs_are_added_for_want_of_others_alone() -> None:
-    flat, few = card()
-    with pytest.MonkeyPatch.context() as patch:
-        patch.setattr(candidates, "_low_walls", lambda *_: pytest.fail("there are others"))
-        generate({"num_approach_points": 64})
-    deep = exact((flat.points[few.contact] - flat.points[few.approach]).norm(dim=1))
-    assert len(few) > 50
-    assert deep.min() < CONFIG.max_pair_distance
+def test_shallow_pairs_are_added_for_want_of_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(candidates, "_low_walls", lambda *_: pytest.fail("there are others"))
+    found, _ = generate()
+    assert len(found) >= 100
 
 
 def test_a_thing_too_low_for_the_tips_has_no_candidates() -> None:
