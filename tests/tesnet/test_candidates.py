@@ -179,7 +179,8 @@ def test_no_part_of_a_hand_comes_lower_than_its_clearance(name: str) -> None:
     up = np.array([0.48, -0.6, 0.64])
     cloud_ = bare_cloud(rng.uniform(-0.1, 0.1, (50, 3)), up=torch.tensor(up).float(), support_height=-0.3)
     Ts = np.array([Pose.random(rng, reach=0.1).matrix for _ in range(30)])
-    clearance = exact(candidates.hand_clearance(cloud_, torch.from_numpy(Ts).float(), hand))
+    poses = torch.from_numpy(Ts).float()
+    clearance = exact(candidates.hand_clearance(cloud_, poses, hand, candidates.wide_open(poses, hand)))
     lowest = np.array([(inside @ T[:3, :3].T @ up).min() + T[:3, 3] @ up + 0.3 for T in Ts])
     assert (lowest >= clearance - ROUNDING).all()
     np.testing.assert_allclose(lowest, clearance, atol=0.012)
@@ -382,7 +383,7 @@ def test_shallow_pairs_are_those_of_a_double_loop(hand: Gripper, cone: ApproachC
     rise = normals @ up
     level = normals - rise[:, None] * up
     level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12)
-    certain, possible = {}, {}
+    certain, possible = set[tuple[int, int]](), set[tuple[int, int]]()
     for c in np.flatnonzero(np.abs(rise) < 0.95):
         d = points[c] - points
         depth, along = -(d @ up), d @ level[c]
@@ -392,12 +393,9 @@ def test_shallow_pairs_are_those_of_a_double_loop(hand: Gripper, cone: ApproachC
             along - limits.min_offset, limits.max_offset - along, 0.005 - aside,
         ]  # fmt: skip
         least = np.min(margins, axis=0)
-        # Tips 7 mm past the contact point, or as far as the support lets them, if that is 5 mm past the approach point.
-        top = points @ up - flat.support_height
-        tips = np.maximum(top - depth - 0.007, CONFIG.support_clearance)
-        reach = np.minimum(top - tips - 0.005, 0.001)
-        certain |= {(a, int(c)): tips[a] for a in np.flatnonzero(np.minimum(least, reach) > 1e-4)}
-        possible |= {(a, int(c)): tips[a] for a in np.flatnonzero(np.minimum(least, reach) > -1e-4)}
+        least = np.where(rise > 0.6, least, np.minimum(least, 0.0))  # of walls it is not told that they are low
+        certain |= {(int(a), int(c)) for a in np.flatnonzero(least > 1e-5)}
+        possible |= {(int(a), int(c)) for a in np.flatnonzero(least > -1e-5)}
     straight = exact(found.Ts_canonical_grasp[:, :3, 2]) @ up < -0.9999
     shallow = found.select(torch.from_numpy(straight))
     if cone is not None and cone.direction[2] > 0:
@@ -405,17 +403,9 @@ def test_shallow_pairs_are_those_of_a_double_loop(hand: Gripper, cone: ApproachC
         return
     pairs = list(zip(shallow.approach.tolist(), shallow.contact.tolist(), strict=True))
     assert len(certain) > 50
-    assert set(certain) <= set(pairs) <= set(possible)
-    tips = exact(shallow.Ts_canonical_grasp[:, :3, 3]) @ up - flat.support_height - hand.tip_offset
-    np.testing.assert_allclose(tips, [possible[pair] for pair in pairs], atol=2e-4)
+    assert certain <= set(pairs) <= possible
     closing = exact(shallow.Ts_canonical_grasp[:, :3, 1])
     np.testing.assert_allclose(closing, level[shallow.contact.numpy()], atol=1e-4)
-
-
-def test_shallow_pairs_are_added_for_want_of_others_alone(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(candidates, "_low_walls", lambda *_: pytest.fail("there are others"))
-    found, _ = generate()
-    assert len(found) >= 100
 
 
 def test_a_thing_too_low_for_the_tips_has_no_candidates() -> None:
