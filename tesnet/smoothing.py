@@ -19,7 +19,7 @@ MOST_LONE = 0.0125
 MOST_POINTS = 40_000
 """Larger clouds stay as they are: their neighbours would take longer to find than the answer."""
 
-_SAMPLE = 400
+_SAMPLE, _BLOCK = 400, 20
 _LONE_RADIUS = 0.006
 _LONE_SHARE = 0.06
 """A lone point has at most so large a part of the median number of others within `_LONE_RADIUS`."""
@@ -56,26 +56,37 @@ class Noise:
 
 
 def measured(points: Tensor) -> Noise:
-    """The noise of a cloud (P, 3), by a sample of its points spread evenly over their order."""
-    cloud = points - points.mean(dim=0)
-    rows = torch.linspace(0, len(points) - 1, min(_SAMPLE, len(points)), device=points.device).long()
-    lengths = cloud.square().sum(dim=1)
-    squares = torch.addmm(lengths[None], cloud[rows], cloud.T, alpha=-2) + lengths[rows, None]
-    others = (squares <= _LONE_RADIUS**2).sum(dim=1) - 1
-    crowd = float(others.float().median())
+    """The noise of a cloud (P, 3), by a sample of its points spread evenly over their order along x.
+
+    A block of the sample is compared with the slab of points around it only.
+    """
+    cloud = points[points[:, 0].argsort()].double() - points.double().mean(dim=0)
+    by_x = cloud[:, 0].contiguous()
+    sample = torch.linspace(0, len(points) - 1, min(_SAMPLE, len(points)), device=points.device).long()
+    crowds, spreads = [], []
+    for block in sample.split(_BLOCK):
+        ends = torch.stack([by_x[block[0]] - _FLAT_RADIUS, by_x[block[-1]] + _FLAT_RADIUS])
+        first, last = torch.searchsorted(by_x, ends).tolist()
+        slab = cloud[first:last] - cloud[block].mean(dim=0)
+        squares = torch.cdist(slab[block - first], slab).square()
+        crowds.append((squares <= _LONE_RADIUS**2).sum(dim=1) - 1)
+        spreads.append(_covariances(slab, squares <= _FLAT_RADIUS**2))
+    others = torch.cat(crowds).double()
+    residuals = smallest_eigenvector(torch.cat(spreads))[0][:, 0].sqrt()
+    crowd = float(others.median())
     # Of a sparse cloud every point is alone.
-    lone = float((others <= _LONE_SHARE * crowd).float().mean()) if _LONE_SHARE * crowd >= 1 else 0.0
-    near = (squares[::2] <= _FLAT_RADIUS**2).double()
-    counts = near.sum(dim=1)
-    near, counts = near[counts >= _FEWEST], counts[counts >= _FEWEST, None]
-    if len(counts) == 0:
-        return Noise(0.0, lone, crowd)
-    exact = cloud.double()
-    means = near @ exact / counts
-    moments = (near @ (exact[:, :, None] * exact[:, None, :]).flatten(1) / counts).view(-1, 3, 3)
-    least, _ = smallest_eigenvector(moments - means[:, :, None] * means[:, None, :])
-    variances = least[:, 0] * counts[:, 0] / (counts[:, 0] - 3)  # three numbers make a plane
-    return Noise(float(variances.sqrt().quantile(_QUARTER)), lone, crowd)
+    lone = float((others <= _LONE_SHARE * crowd).double().mean()) if _LONE_SHARE * crowd >= 1 else 0.0
+    return Noise(float(residuals.quantile(_QUARTER)) if len(residuals) else 0.0, lone, crowd)
+
+
+def _covariances(points: Tensor, members: Tensor) -> Tensor:
+    """(B', 3, 3) of the points (P, 3) of each mask (B, P) that has enough of them, as after a plane's three numbers."""
+    counts = members.sum(dim=1)
+    members, counts = members[counts >= _FEWEST].double(), counts[counts >= _FEWEST, None].double()
+    means = members @ points / counts
+    moments = (members @ (points[:, :, None] * points[:, None, :]).flatten(1) / counts).view(-1, 3, 3)
+    scale = counts / (counts - 3)
+    return (moments - means[:, :, None] * means[:, None, :]) * scale[..., None]
 
 
 def without_lone(table: Tensor, noise: Noise) -> Tensor:
