@@ -47,6 +47,9 @@ _NEARLY_FARTHEST = 0.7
 _PAIRS_AT_ONCE = 500_000
 """Pairs of points whose offsets are in memory at a time, some 20 MB."""
 
+_FITTED_AT_ONCE = 250
+"""Candidates whose walls are looked for at a time: a large hand has thousands of points between its fingers."""
+
 MOST_PAIRS = 500_000
 """Of more pairs in reach so many are tried, spread evenly: hands with very long fingers reach millions."""
 
@@ -170,7 +173,11 @@ def generate(
     if len(survivors) > query.most_candidates:
         chosen = torch.randperm(len(survivors), generator=generator)[: query.most_candidates].sort().values
         survivors = survivors[chosen.to(survivors.device)]
-    return _fitted(cloud, query, config, candidates.select(survivors)), rejected
+    found = _no_candidates(cloud, query.gripper)
+    for rows in survivors.split(_FITTED_AT_ONCE):
+        between()
+        found = found.joined_by(_fitted(cloud, query, config, candidates.select(rows)))
+    return found, rejected
 
 
 def more_approach_points(count: int) -> int:

@@ -20,7 +20,7 @@ MAX_GRASPS = 1000
 MAX_APPROACH_POINTS = 1024
 MAX_CANDIDATES = 20_000
 LARGE_HAND = 0.25
-MAX_CANDIDATES_OF_LARGE_HANDS = 2_000
+MAX_CANDIDATES_OF_LARGE_HANDS = 1_000
 """Of a hand with a part longer than `LARGE_HAND`, metres, and so than any known hand: what it may meet takes long."""
 MAX_VIEWPOINTS = 64
 MAX_SEED = 2**63 - 1

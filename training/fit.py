@@ -20,6 +20,7 @@ from tqdm import tqdm
 from tesnet import networks, weights
 from tesnet.networks import Network
 from tesnet.predictor import configuration_of
+from tesnet.threads import Threads
 from tesnet.whole_file import write_whole
 from training import metrics
 from training.augment import augment, vary
@@ -147,7 +148,7 @@ def fit(
         recipe: how to train.
         out: weights file.
         epochs: stop after so many, whatever the recipe's schedule.
-        threads: of the CPU.
+        threads: of the CPU; while other processes keep the cores busy steps take fewer, which changes rounding alone.
         seed: of the first weights, of orders and of draws.
         version: that the weights' header carries.
         start: weights to begin with, also older ones with fewer inputs; None for random ones.
@@ -159,6 +160,7 @@ def fit(
         WeightsError: `start` cannot be read.
     """
     torch.set_num_threads(threads)
+    cores = Threads(threads)
     torch.manual_seed(seed)
     network = _first_network(name, recipe, start)
     if networks.is_weightless(name):
@@ -182,7 +184,9 @@ def fit(
     last_epoch = min(recipe.max_epochs, epochs or recipe.max_epochs)
     # Only halving ends the training: along the cosine the rate is small at the start, too.
     while progress.epoch < last_epoch and (recipe.cosine or progress.learning_rate >= recipe.smallest_learning_rate):
-        loss = _epoch(network, optimiser, recipe, train_views, prior, progress, approach_points, checkpoint)
+        loss = _epoch(
+            network, optimiser, recipe, train_views, prior, progress, approach_points, checkpoint, cores=cores
+        )
         measures, of_all = validate(network, validation_views, seed, calibration_views)
         _schedule(recipe, progress, measures["served_loss"])
         if recipe.keep == "last" or measures["served_loss"] <= progress.best_loss:
@@ -246,6 +250,8 @@ def _epoch(
     progress: _Progress,
     approach_points: int | None,
     checkpoint: Path,
+    *,
+    cores: Threads,
 ) -> float:
     """One pass over the views in a random order, from the step that was reached; the mean training loss.
 
@@ -268,8 +274,9 @@ def _epoch(
         for index in order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step]:
             rng = np.random.default_rng([progress.seed, progress.epoch, int(index)])
             view = vary(views[index], rng) if recipe.vary else views[index]
-            loss = _view_loss(network, augment(view, rng), log_odds, recipe, rng, approach_points)
-            (loss / recipe.views_per_step).backward()
+            with cores.working():
+                loss = _view_loss(network, augment(view, rng), log_odds, recipe, rng, approach_points)
+                (loss / recipe.views_per_step).backward()
             progress.loss += float(loss.detach())
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
