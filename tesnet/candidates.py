@@ -303,17 +303,17 @@ def _without_walls(
     Without `up` such faces cannot be told from others: there, these candidates are for want of others. Low things are
     those over a known plane whose walls are too low to measure a depth on.
     """
-    if cloud.up is not None or count == 0:
-        outlines = edges()
-        if len(outlines.points):
-            depths = (config.min_offset, config.max_depth)
-            yield _along_travel(cloud, query.gripper, config, approach_points, outlines, depths)
     if cloud.up is not None:
         low_faces = is_low(cloud) & (cloud.normals @ cloud.up >= _UPWARD)
         low = approach_points[low_faces[approach_points]]
         if len(low):
             walls = _low_walls(cloud, cloud.up)
             yield _along_travel(cloud, query.gripper, config, low, walls, (0.0, config.min_depth))
+    if cloud.up is not None or count == 0:
+        outlines = edges()
+        if len(outlines.points):
+            depths = (config.min_offset, config.max_depth)
+            yield _along_travel(cloud, query.gripper, config, approach_points, outlines, depths)
 
 
 def _low_walls(cloud: PreparedCloud, up: Tensor) -> Outline:
