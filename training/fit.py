@@ -25,7 +25,7 @@ from tesnet.whole_file import write_whole
 from training import metrics
 from training.augment import augment, vary
 from training.evaluate import validate
-from training.views import LabelledView, LabelsError, load_views, scene_files
+from training.views import LabelledView, LabelsError, StoredViews, load_views, scene_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -165,7 +165,7 @@ def fit(
     network = _first_network(name, recipe, start)
     if networks.is_weightless(name):
         raise LabelsError(f"{name} has no parameters to train; choose another network")
-    train_views = [view for view in load_views(data, network.preparation) if metrics.usable(view.success.numpy())]
+    train_views = StoredViews(data, network.preparation, metrics.usable)
     if not train_views:
         raise LabelsError(
             f"no view of the training labels has {metrics.FEWEST_POSITIVES} successes and a failure; "
@@ -173,8 +173,7 @@ def fit(
         )
     validation_views = list(load_views(validation, network.preparation))
     calibration_views = list(load_views(calibration, network.preparation))
-    labels = sum(len(view.outcomes) for view in train_views)
-    prior = sum(int(view.success.sum()) for view in train_views) / labels
+    labels, prior = train_views.labels, train_views.successes / train_views.labels
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
     progress = _resume(checkpoint, network, optimiser) or _Progress(asdict(recipe), seed, recipe.learning_rate)
@@ -245,7 +244,7 @@ def _epoch(
     network: Network,
     optimiser: torch.optim.Optimizer,
     recipe: Recipe,
-    views: Sequence[LabelledView],
+    views: StoredViews,
     prior: float,
     progress: _Progress,
     approach_points: int | None,

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 import json
 import zipfile
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
 from dataclasses import asdict, dataclass, replace
 from pathlib import Path
 from typing import Any
@@ -146,10 +146,20 @@ def load_scene(path: Path) -> tuple[dict[str, Any], list[LabelledView]]:
         with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
             arrays = dict(stored)
         description = json.loads(arrays["description"].tobytes())
-        count = sum(name.endswith("/frame") for name in arrays)
-        return description, [_view(arrays, number) for number in range(count)]
-    except (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile) as error:
-        raise LabelsError(f"{path} holds no labelled scene ({error}); remove it and generate again") from error
+        return description, [_view(arrays, number) for number in range(_count_views(arrays))]
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+
+
+_DAMAGE = (OSError, ValueError, KeyError, EOFError, zipfile.BadZipFile)
+
+
+def _damaged(path: Path, error: Exception) -> LabelsError:
+    return LabelsError(f"{path} holds no labelled scene ({error}); remove it and generate again")
+
+
+def _count_views(names: Iterable[str]) -> int:
+    return sum(name.endswith("/frame") for name in names)
 
 
 def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
@@ -249,6 +259,57 @@ def load_views(folders: Sequence[Path], preparation: PreparationConfig) -> Itera
         description, views = load_scene(path)
         check_preparation(path, description, preparation)
         yield from views
+
+
+class StoredViews:
+    """Labelled views that lie in scene files; each is read anew whenever it is asked for, so any number has room.
+
+    Reading one takes some milliseconds, where a step of training with it takes a hundred.
+
+    Args:
+        folders: of scene files.
+        preparation: that their clouds must have.
+        wanted: which views there shall be, by whether their candidates succeed, (C,) bool.
+
+    Raises:
+        LabelsError: no scenes, or clouds that were prepared in another way; later, a file that was damaged since.
+    """
+
+    def __init__(
+        self, folders: Sequence[Path], preparation: PreparationConfig, wanted: Callable[[NDArray[np.bool_]], bool]
+    ) -> None:
+        self.labels, self.successes = 0, 0
+        self._places: list[tuple[Path, int]] = []
+        for path in scene_files(folders):
+            for number, success in enumerate(_successes(path, preparation)):
+                if wanted(success):
+                    self._places.append((path, number))
+                    self.labels += len(success)
+                    self.successes += int(success.sum())
+
+    def __len__(self) -> int:
+        return len(self._places)
+
+    def __getitem__(self, index: int) -> LabelledView:
+        """The view at an index."""
+        path, number = self._places[index]
+        try:
+            with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+                return _view(stored, number)
+        except _DAMAGE as error:
+            raise _damaged(path, error) from error
+
+
+def _successes(path: Path, preparation: PreparationConfig) -> list[NDArray[np.bool_]]:
+    """Which candidates of each view of a scene succeed (C,), without reading the clouds."""
+    try:
+        with path.open("rb") as file, np.load(file, allow_pickle=False) as stored:
+            description = json.loads(stored["description"].tobytes())
+            outcomes = [stored[f"{number}/outcomes"] for number in range(_count_views(stored.files))]
+    except _DAMAGE as error:
+        raise _damaged(path, error) from error
+    check_preparation(path, description, preparation)
+    return [codes == OUTCOME_KINDS.index("success") for codes in outcomes]
 
 
 def check_preparation(path: Path, description: Mapping[str, Any], wanted: PreparationConfig) -> None:

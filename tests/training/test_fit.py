@@ -23,7 +23,7 @@ from training import fit as fitting
 from training import metrics
 from training.evaluate import evaluate
 from training.fit import PRESETS, Recipe, fit
-from training.views import LabelledView, LabelsError, load_views
+from training.views import LabelledView, LabelsError, StoredViews, load_views
 
 Shown = tuple[PreparedCloud, Candidates, torch.Tensor]
 """A cloud, candidates of it and which of them are mirrored."""
@@ -371,6 +371,25 @@ def test_a_checkpoint_from_before_a_field_of_the_recipe_goes_on(folder: Path, tm
     run(folder, tmp_path / "a.safetensors", epochs=2)
     log = (tmp_path / "a.log.jsonl").read_text().splitlines()
     assert [json.loads(line)["epoch"] for line in log] == [1, 2]
+
+
+def test_views_read_one_by_one_train_as_those_in_memory(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    read = StoredViews.__getitem__
+    in_memory: dict[int, LabelledView] = {}
+
+    def remembered(views: StoredViews, index: int) -> LabelledView:
+        if int(index) not in in_memory:
+            in_memory[int(index)] = read(views, index)
+        return in_memory[int(index)]
+
+    run(folder, tmp_path / "streamed.safetensors", epochs=2)
+    monkeypatch.setattr(StoredViews, "__getitem__", remembered)
+    run(folder, tmp_path / "remembered.safetensors", epochs=2)
+    assert len(in_memory) == 3
+    one, other = (weights.load(tmp_path / f"{name}.safetensors")[0] for name in ("streamed", "remembered"))
+    assert all(torch.equal(one[name], other[name]) for name in one)
 
 
 def test_training_learns_the_training_views(folder: Path, tmp_path: Path) -> None:

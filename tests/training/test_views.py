@@ -1,6 +1,8 @@
 from __future__ import annotations
 
+import gc
 import json
+import weakref
 from dataclasses import asdict, replace
 from pathlib import Path
 
@@ -11,7 +13,7 @@ import torch
 from tesnet.cloud import PreparationConfig
 from tesnet.geometry import PANDA, Pose
 from tests.training.synthetic import labelled_view, write
-from training.views import LabelsError, load_scene, load_views, save_scene, scene_files
+from training.views import LabelsError, StoredViews, load_scene, load_views, save_scene, scene_files
 
 
 def test_labels_round_trip(tmp_path: Path) -> None:
@@ -113,6 +115,35 @@ def test_scenes_are_read_in_order_from_every_folder(tmp_path: Path) -> None:
     assert sum(1 for _ in load_views([tmp_path], PreparationConfig())) == 3
     with pytest.raises(LabelsError, match="python -m training generate"):
         scene_files([tmp_path / "c"])
+
+
+def test_stored_views_are_those_of_the_files_and_are_not_kept(tmp_path: Path) -> None:
+    for number in range(3):
+        views = [labelled_view(number, count=30, positives=3 * number + step) for step in range(2)]
+        save_scene(tmp_path / f"scene_{number}.npz", {}, views)
+    stored = StoredViews([tmp_path], PreparationConfig(), lambda success: int(success.sum()) >= 3)
+    loaded = [view for view in load_views([tmp_path], PreparationConfig()) if int(view.success.sum()) >= 3]
+    assert len(stored) == len(loaded) == 4
+    assert (stored.labels, stored.successes) == (120, 3 + 4 + 6 + 7)
+    for index in (2, 0, 3, 1):
+        one, other = stored[index], loaded[index]
+        for name in ("poses", "widths", "approach", "contact", "outcomes", "collision_free"):
+            assert torch.equal(getattr(one, name), getattr(other, name))
+        for name in ("points", "normals", "neighbours", "spectrum", "view_directions"):
+            assert torch.equal(getattr(one.cloud, name), getattr(other.cloud, name))
+    kept = weakref.ref(stored[0].cloud.points)
+    gc.collect()
+    assert kept() is None
+
+
+def test_a_file_that_is_damaged_later_is_refused_when_its_view_is_asked_for(tmp_path: Path) -> None:
+    path = write(tmp_path, [labelled_view(count=30)]) / "scene_0000000.npz"
+    stored = StoredViews([tmp_path], PreparationConfig(), lambda _: True)
+    path.write_bytes(path.read_bytes()[:-500])
+    with pytest.raises(LabelsError, match="remove it and generate again"):
+        stored[0]
+    with pytest.raises(LabelsError, match="remove it and generate again"):
+        StoredViews([tmp_path], PreparationConfig(), lambda _: True)
 
 
 def test_writing_leaves_no_temporary_file(tmp_path: Path) -> None:
