@@ -15,6 +15,7 @@ from simharness.sim.sensors.catalogue import D435, SENSORS, SensorName, random_s
 from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.sensors.stereo import Stereo
 from simharness.sim.world import World
+from tesnet.calibration import calibrated
 from tesnet.geometry import Gripper, Pose
 from tesnet.query import GraspQuery
 
@@ -73,9 +74,11 @@ class Viewing:
         return observe_from(world, self.cameras, rng, sensor, table_in_view=self.shows != "box")
 
     def query(self, observation: Observation, seed: int, gripper: Gripper) -> GraspQuery:
-        """What is asked about an observation."""
-        query = query_about(observation, seed, gripper)
-        return replace(query, workspace=None) if self.shows == "open" else query
+        """What is asked about an observation; where the table is shown, it is asked to calibrate, and that is done."""
+        query = query_about(observation, seed, gripper, calibrate=self.shows != "box")
+        if self.shows == "open":
+            query = replace(query, workspace=None)
+        return calibrated(query)[0]
 
 
 def draw_viewing(camera: Camera, sensor: str | None, rng: np.random.Generator) -> Viewing:

@@ -116,8 +116,8 @@ def test_scenes_are_rendered_with_clouds_as_the_service_prepares_them(
 ) -> None:
     queries: list[GraspQuery] = []
 
-    def noted(*arguments: Any) -> GraspQuery:
-        queries.append(query_about(*arguments))
+    def noted(*arguments: Any, **options: Any) -> GraspQuery:
+        queries.append(query_about(*arguments, **options))
         return queries[-1]
 
     monkeypatch.setattr(viewing, "query_about", noted)

@@ -83,8 +83,8 @@ def test_labels_show_the_clouds_as_the_service_prepares_them(monkeypatch: pytest
     """To the last bit, so that no network learns from normals of another neighbourhood than it is served."""
     queries: list[GraspQuery] = []
 
-    def noted(*arguments: Any) -> GraspQuery:
-        queries.append(query_about(*arguments))
+    def noted(*arguments: Any, **options: Any) -> GraspQuery:
+        queries.append(query_about(*arguments, **options))
         return queries[-1]
 
     monkeypatch.setattr(viewing, "query_about", noted)
