@@ -12,7 +12,7 @@ def cpu_seconds(pid: int) -> int:
     return sum(int(field) for field in fields[11:13])
 
 
-def test_neighbours_compute_without_pause_and_end_with_the_context():
+def test_neighbours_compute_without_pause_and_end_with_the_context() -> None:
     with neighbours(2) as processes:
         before = [cpu_seconds(process.pid) for process in processes]
         while any(cpu_seconds(process.pid) <= start for process, start in zip(processes, before, strict=True)):
@@ -21,7 +21,7 @@ def test_neighbours_compute_without_pause_and_end_with_the_context():
     assert all(process.poll() is not None for process in processes)
 
 
-def test_neighbours_end_when_who_started_them_is_killed():
+def test_neighbours_end_when_who_started_them_is_killed() -> None:
     program = (
         "import os, signal\n"
         "from bench.neighbours import neighbours\n"

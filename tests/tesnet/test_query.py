@@ -18,7 +18,6 @@ from tesnet.query import (
     MAX_CANDIDATES_OF_LARGE_HANDS,
     NO_VIEWPOINT,
     ApproachCone,
-    GraspQuery,
     box_option,
 )
 from tests.tesnet.scenes import UP, ask
@@ -224,20 +223,21 @@ def test_the_origin_as_default_viewpoint_is_told_of_a_far_cloud_too() -> None:
 
 @pytest.mark.parametrize("distance", [1.1e9, 2e9, 1e12, 1e30, 3.4e38])
 @pytest.mark.parametrize("dtype", [np.float32, np.float64])
-def test_a_cloud_that_lies_nowhere_near_is_refused_and_a_few_such_points_are_not(distance: float, dtype: type) -> None:
-    points = np.random.default_rng(0).uniform(0, 0.1, (100, 3)).astype(dtype)
+def test_a_cloud_that_lies_nowhere_near_is_refused_and_a_few_such_points_are_not(distance: float, dtype: Any) -> None:
+    points: Any = np.random.default_rng(0).uniform(0, 0.1, (100, 3)).astype(dtype)
     with pytest.raises(InvalidQuery, match=r"m from the origin \(limit 1e\+09 m\)"):
-        GraspQuery(points + dtype(distance))
+        ask(points + dtype(distance))
     points[:3] = distance
-    assert len(GraspQuery(points).points) == 100
+    assert len(ask(points).points) == 100
 
 
 @pytest.mark.parametrize("part", ["hand_to_tcp", "palm_length"])
 def test_a_hand_with_a_very_long_part_has_fewer_candidates(part: str) -> None:
     points = np.zeros((1, 3))
     for name, hand in HANDS.items():
-        assert GraspQuery(points, gripper=hand.gripper, max_candidates=MAX_CANDIDATES).most_candidates == 20_000, name
-    large = replace(PANDA, **{part: LARGE_HAND + 0.01})
-    asked = GraspQuery(points, gripper=large, max_candidates=MAX_CANDIDATES)
+        assert ask(points, gripper=hand.gripper, max_candidates=MAX_CANDIDATES).most_candidates == 20_000, name
+    longer: Any = {part: LARGE_HAND + 0.01}
+    large = replace(PANDA, **longer)
+    asked = ask(points, gripper=large, max_candidates=MAX_CANDIDATES)
     assert asked.most_candidates == asked.candidate_limit == MAX_CANDIDATES_OF_LARGE_HANDS
-    assert GraspQuery(points, gripper=large, max_candidates=7).most_candidates == 7
+    assert ask(points, gripper=large, max_candidates=7).most_candidates == 7

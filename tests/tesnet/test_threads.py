@@ -1,6 +1,8 @@
 import itertools
 import math
 import os
+from collections.abc import Iterator
+from pathlib import Path
 
 import pytest
 import torch
@@ -36,21 +38,21 @@ class Machine:
 
 
 @pytest.fixture(autouse=True)
-def _torch_keeps_its_threads():
+def _torch_keeps_its_threads() -> Iterator[None]:
     before = torch.get_num_threads()
     yield
     torch.set_num_threads(before)
 
 
 @pytest.mark.parametrize("most", [1, 2, 8])
-def test_free_cores_are_all_used(most):
+def test_free_cores_are_all_used(most: int) -> None:
     machine = Machine(8)
     threads = machine.threads(most)
     assert {machine.work(threads) for _ in range(50)} == {most}
 
 
 @pytest.mark.parametrize("tells_idle", [True, False])
-def test_beside_busy_neighbours_one_thread_computes_and_later_all_again(tells_idle):
+def test_beside_busy_neighbours_one_thread_computes_and_later_all_again(tells_idle: bool) -> None:
     machine = Machine(2, tells_idle)
     threads = machine.threads(2)
     machine.neighbours = 2
@@ -59,21 +61,21 @@ def test_beside_busy_neighbours_one_thread_computes_and_later_all_again(tells_id
     assert [machine.work(threads) for _ in range(5)][-1] == 2
 
 
-def test_a_neighbour_that_leaves_one_core_to_us_is_left_alone():
+def test_a_neighbour_that_leaves_one_core_to_us_is_left_alone() -> None:
     machine = Machine(2)
     threads = machine.threads(2)
     machine.neighbours = 1
     assert [machine.work(threads) for _ in range(50)] == [2] + 49 * [1]
 
 
-def test_of_many_cores_those_are_used_that_the_neighbours_leave():
+def test_of_many_cores_those_are_used_that_the_neighbours_leave() -> None:
     machine = Machine(8)
     threads = machine.threads(8)
     machine.neighbours = 3
     assert [machine.work(threads) for _ in range(50)][2:] == 48 * [5]
 
 
-def test_where_nobody_tells_what_is_idle_trials_become_rare_and_never_end():
+def test_where_nobody_tells_what_is_idle_trials_become_rare_and_never_end() -> None:
     machine = Machine(2, tells_idle=False)
     threads = machine.threads(2)
     machine.neighbours = 1
@@ -85,7 +87,7 @@ def test_where_nobody_tells_what_is_idle_trials_become_rare_and_never_end():
     assert LONGEST_PAUSE <= pauses[-1] <= LONGEST_PAUSE + 1
 
 
-def test_short_pieces_are_judged_together():
+def test_short_pieces_are_judged_together() -> None:
     machine = Machine(2)
     threads = machine.threads(2)
     machine.neighbours = 2
@@ -93,11 +95,11 @@ def test_short_pieces_are_judged_together():
     assert used == 4 * [2] + 6 * [1]
 
 
-def test_work_that_is_given_up_teaches_nothing():
+def test_work_that_is_given_up_teaches_nothing() -> None:
     machine = Machine(2)
     threads = machine.threads(2)
 
-    def be_given_up():
+    def be_given_up() -> None:
         with threads.working():
             machine.seconds += 1
             raise GaveUp
@@ -107,13 +109,13 @@ def test_work_that_is_given_up_teaches_nothing():
     assert threads.number == 2
 
 
-def test_torchs_own_number_is_the_most_unless_another_is_wanted():
+def test_torchs_own_number_is_the_most_unless_another_is_wanted() -> None:
     torch.set_num_threads(3)
     assert Threads().most == 3
     assert Threads(2).most == 2
 
 
-def test_idle_seconds_are_those_of_the_cores_that_this_process_may_use(tmp_path):
+def test_idle_seconds_are_those_of_the_cores_that_this_process_may_use(tmp_path: Path) -> None:
     ours = min(os.sched_getaffinity(0))
     other = max(os.sched_getaffinity(0)) + 1
     statistics = tmp_path / "stat"
@@ -125,7 +127,7 @@ def test_idle_seconds_are_those_of_the_cores_that_this_process_may_use(tmp_path)
     assert 0 <= idle_seconds() <= idle_seconds()
 
 
-def test_a_core_is_not_shared_at_a_moments_disturbance():
+def test_a_core_is_not_shared_at_a_moments_disturbance() -> None:
     machine = Machine(2)
     threads = machine.threads(2)
     with threads.working():
