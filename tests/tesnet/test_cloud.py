@@ -212,7 +212,9 @@ def test_who_saw_a_point_or_the_normals_that_came_with_it_turn_the_normals(told_
 
 @pytest.mark.parametrize("distance", [1.0, 1e3, 1e6, 1e9, 1e12])
 @pytest.mark.parametrize("direction", [(1, 1, 1), (0, 0, 1), (-3, 1, 2)])
-def test_the_canonical_frame_is_one_however_far_and_small_the_cloud_is(distance, direction):
+def test_the_canonical_frame_is_one_however_far_and_small_the_cloud_is(
+    distance: float, direction: tuple[float, float, float]
+) -> None:
     """`Pose` refuses what is no rotation."""
     points = distance * torch.tensor([direction], dtype=torch.float32).expand(500, 3)
     along = torch.nn.functional.normalize(torch.tensor(direction).double(), dim=0)

@@ -16,6 +16,7 @@ from tesnet import networks, weights
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.predictor import GraspPredictor, configuration_of
+from tesnet.threads import Threads
 from tests.tesnet.scenes import tabletop_query
 from tests.training.synthetic import labelled_view, write
 from training import evaluate as evaluating
@@ -176,7 +177,7 @@ def watched_epochs(
     epochs = []
     for _ in range(count):
         optimiser = torch.optim.SGD(network.parameters(), lr=recipe.learning_rate)
-        fitting._epoch(network, optimiser, recipe, views, 0.5, progress, None, out)  # type: ignore[arg-type]
+        fitting._epoch(network, optimiser, recipe, views, 0.5, progress, None, out, cores=Threads(1))  # type: ignore[arg-type]
         epochs.append(network.shown)
         network.shown = []
     return epochs
