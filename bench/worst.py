@@ -110,7 +110,9 @@ def _words(kind: Any) -> tuple[Any, ...]:
 
 
 def _largest_hand() -> Gripper:
-    sizes = {name: LONGEST_PART for name, size in Gripper().sizes().items() if size and name != "max_width"}
+    sizes: dict[str, Any] = {
+        name: LONGEST_PART for name, size in Gripper().sizes().items() if size and name != "max_width"
+    }
     return Gripper(**sizes | {"max_width": WIDEST, "tip_offset": Gripper().tip_offset})
 
 
@@ -121,7 +123,7 @@ def queries() -> Mapping[str, Callable[[], GraspQuery]]:
     def with_option(cloud: str, name: str) -> GraspQuery:
         query = clouds()[cloud]()
         if name != EVERYTHING:
-            return replace(query, **{"support_height": None} | options(query)[name])
+            return replace(query, **{"support_height": None, **options(query)[name]})
         for option in options(query).values():
             if "max_candidates" not in option and ("up" not in option or query.up is None):
                 with contextlib.suppress(InvalidQuery):  # beside another option
