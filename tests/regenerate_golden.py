@@ -49,7 +49,8 @@ def _with_table() -> NDArray[np.float64]:
     rng = np.random.default_rng(6)
     seen = cast((TABLE, *THINGS), scenes.CAMERA[None], rng, noise=0.0005).points
     near = np.abs(seen[:, :2]).max(axis=1) < 0.25
-    return seen[near & ((seen[:, 2] > 0.01) | (rng.random(len(seen)) < 0.3))]
+    kept: NDArray[np.float64] = seen[near & ((seen[:, 2] > 0.01) | (rng.random(len(seen)) < 0.3))]
+    return kept
 
 
 def _of_a_card() -> NDArray[np.float64]:
@@ -62,7 +63,8 @@ def _from_above() -> NDArray[np.float64]:
     """A box and a bowl, each seen from straight above: of the box no wall."""
     things = (Slab((-0.05, 0.0, 0.0), (0.05, 0.04, 0.06)), Bowl((0.06, 0.0, 0.0), 0.035, 0.004))
     seen = cast((TABLE, *things), OVERHEAD, np.random.default_rng(0), noise=0.0003).points
-    return seen[np.abs(seen[:, :2]).max(axis=1) < 0.13]
+    kept: NDArray[np.float64] = seen[np.abs(seen[:, :2]).max(axis=1) < 0.13]
+    return kept
 
 
 RING = around(3)

@@ -408,7 +408,8 @@ def test_shallow_pairs_are_those_of_a_double_loop(
     rise = normals @ up
     level = normals - rise[:, None] * up
     level /= np.maximum(np.linalg.norm(level, axis=1, keepdims=True), 1e-12)
-    certain, possible = {}, {}
+    certain: dict[tuple[int, int], float] = {}
+    possible: dict[tuple[int, int], float] = {}
     for c in np.flatnonzero(np.abs(rise) < 0.95):
         d = points[c] - points
         depth, along = -(d @ up), d @ level[c]
@@ -422,8 +423,8 @@ def test_shallow_pairs_are_those_of_a_double_loop(
         tips = tips_over(top, top - depth)
         short = tips - (top - depth - 0.007)
         reach = np.minimum.reduce([top - tips - 0.003, 0.007 - short, rise - 0.5, 0.017 - top, np.full(len(d), 0.001)])
-        certain |= {(a, int(c)): tips[a] for a in np.flatnonzero(np.minimum(least, reach) > 1e-4)}
-        possible |= {(a, int(c)): tips[a] for a in np.flatnonzero(np.minimum(least, reach) > -1e-4)}
+        certain |= {(int(a), int(c)): float(tips[a]) for a in np.flatnonzero(np.minimum(least, reach) > 1e-4)}
+        possible |= {(int(a), int(c)): float(tips[a]) for a in np.flatnonzero(np.minimum(least, reach) > -1e-4)}
     straight = exact(found.Ts_canonical_grasp[:, :3, 2]) @ up < -0.9999
     depths = exact(flat.points[found.approach] - flat.points[found.contact]) @ up
     shallow = found.select(torch.from_numpy(straight & (depths < limits.min_depth)))
