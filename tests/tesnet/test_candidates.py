@@ -163,7 +163,7 @@ def test_no_candidate_breaks_a_limit_of_the_conventions(seed: int, monkeypatch: 
     p_a = exact(ready(seed).points[found.approach])
     Ts = exact(found.Ts_canonical_grasp)
     reach = np.einsum("ij,ij->i", Ts[:, :3, 3] - p_a, Ts[:, :3, 2]) + PANDA.tip_offset
-    assert (reach[low < 0.004 - ROUNDING] <= WANTED_REACH + ROUNDING).all()
+    assert (reach[low < 0.004 - 2e-5] <= WANTED_REACH + 2e-5).all()  # centring may cost 10 micrometres
 
 
 def lowest_corner(cloud_: cloud.PreparedCloud, found: Candidates) -> Array:
