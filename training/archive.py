@@ -291,4 +291,5 @@ def _render_view(world: World, view: ArchivedView, preparation: cloud.Preparatio
         collision_free=torch.from_numpy(view.collision_free.copy()),
         scene="",
         gripper=view.gripper,
+        sensor=view.viewing.sensor,
     )

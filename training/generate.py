@@ -319,6 +319,7 @@ def _label_view(
         collision_free=free[which],
         scene=config.scene,
         gripper=hand.gripper,
+        sensor=viewing.sensor,
     )
 
 

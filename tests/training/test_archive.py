@@ -64,6 +64,7 @@ def test_more_views_show_the_labels_of_their_scene_from_new_cameras(labels: Path
     for before, after in zip(scene_files([labels]), scene_files([tmp_path / "again"]), strict=True):
         old, (description, views) = load_scene(before)[1], load_scene(after)
         cameras = [viewing["cameras"] for viewing in description["views"]]
+        assert [viewing["sensor"] for viewing in description["views"]] == [view.sensor for view in views]
         assert len(cameras) == len(old) + 3
         assert len({json.dumps(camera) for camera in cameras}) == len(cameras)
         recorded = [_in_world(view) for view in old]

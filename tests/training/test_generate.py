@@ -137,6 +137,7 @@ def test_views_through_any_sensor_are_told_so_that_they_can_be_taken_again() -> 
     sets, judge = generating.object_sets(config), generating.Judge.of(config)
     description, views = generating.label_scene(config, sets, 1, judge)
     assert len(description["views"]) == len(views) > 0
+    assert [look["sensor"] for look in description["views"]] == [view.sensor for view in views]
     models = {model.name: model for some in sets for model in some}
     with World() as world:
         restore_scene(world, description, models)
