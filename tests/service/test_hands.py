@@ -65,8 +65,8 @@ DOORS = {door.__name__: door for door in (by_json, by_query, by_form, by_npz, by
     [
         ("robotiq_2f85", HANDS["robotiq_2f85"].gripper),
         (
-            {"name": "rg2", "max_width": 0.05},
-            HANDS["rg2"].gripper.with_sizes({"max_width": 0.05}),
+            {"name": "rg2", "max_width": 0.07},
+            HANDS["rg2"].gripper.with_sizes({"max_width": 0.07}),
         ),
         ({"max_width": 0.12, "hand_to_tcp": 0.2}, PANDA.with_sizes({"max_width": 0.12, "hand_to_tcp": 0.2})),
     ],

