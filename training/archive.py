@@ -21,7 +21,7 @@ from tqdm import tqdm
 
 from simharness.play.crew import Emit, Work, crew
 from simharness.sim.objects import ObjectModel, load_object_set
-from simharness.sim.outcomes import OUTCOME_KINDS
+from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.scene import restore_scene
 from simharness.sim.world import World
 from tesnet import cloud

@@ -27,7 +27,7 @@ from simharness.play.crew import Done, Emit, Work, crew
 from simharness.sim.execute import label_strict, snapshot_of
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel, load_object_set
-from simharness.sim.outcomes import OUTCOME_KINDS
+from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.scene import Variety, describe, make_scene, scales_for
 from simharness.sim.world import World
 from tesnet import candidates, cloud, networks

@@ -13,7 +13,7 @@ import numpy as np
 import torch
 from numpy.typing import NDArray
 
-from simharness.sim.outcomes import OUTCOME_KINDS
+from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from tesnet.candidates import Candidates, poses_along
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import PANDA, Gripper, Pose

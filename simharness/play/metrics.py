@@ -15,7 +15,7 @@ from dataclasses import dataclass
 import numpy as np
 
 from simharness.play.records import ROUND_ENDS, RoundRecord
-from simharness.sim.outcomes import FAILURE_KINDS
+from simharness.sim.outcome_kinds import FAILURE_KINDS
 
 Z_95 = 1.959963984540054
 """Two-sided 95 % quantile of the standard normal distribution."""

@@ -13,7 +13,7 @@ import numpy as np
 from jaxtyping import Float64
 
 from simharness.play.settings import RunSettings
-from simharness.sim.outcomes import OutcomeKind
+from simharness.sim.outcome_kinds import OutcomeKind
 
 RoundEnd = Literal["empty", "two_failures", "no_grasps"]
 

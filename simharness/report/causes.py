@@ -24,7 +24,7 @@ from simharness.sim.camera import INTRINSICS, Images, Observation
 from simharness.sim.execute import Grip
 from simharness.sim.hand import HandContact, HandPart
 from simharness.sim.objects import ObjectModel
-from simharness.sim.outcomes import OutcomeKind
+from simharness.sim.outcome_kinds import OutcomeKind
 from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT
 from tesnet.geometry import Pose
 

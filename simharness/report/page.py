@@ -13,7 +13,7 @@ from simharness.play.metrics import Rate, Summary, summarise
 from simharness.play.photographer import FAILURES, FIRST_ROUNDS, VIEWS, picture_name
 from simharness.play.records import AttemptRecord, Run
 from simharness.report.report import percent, times, title
-from simharness.sim.outcomes import OUTCOMES
+from simharness.sim.outcome_kinds import OUTCOMES
 
 _ENDS: Mapping[str, tuple[str, str]] = {
     "empty": ("the table is empty", "#16a34a"),

@@ -19,7 +19,7 @@ from jaxtyping import Float
 from numpy.typing import NDArray
 
 from simharness.sim.hand import Hand, HandContact, Placement, placements
-from simharness.sim.outcomes import OutcomeKind
+from simharness.sim.outcome_kinds import OutcomeKind
 from simharness.sim.scene import settle
 from simharness.sim.world import TIMESTEP, World
 from tesnet.geometry import Pose

@@ -6,7 +6,7 @@ from pathlib import Path
 
 import torch
 
-from simharness.sim.outcomes import OUTCOME_KINDS
+from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from tesnet import candidates
 from tests.tesnet.scenes import WORKSPACE, prepared, tabletop_query
 from training.views import LabelledView, save_scene

@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 import torch
 
-from simharness.sim.outcomes import OUTCOME_KINDS
+from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
 from simharness.sim.scene import restore_scene
 from simharness.sim.world import World

@@ -3,7 +3,7 @@ from __future__ import annotations
 import re
 from pathlib import Path
 
-from simharness.sim.outcomes import FAILURE_KINDS, OUTCOME_KINDS, OUTCOMES
+from simharness.sim.outcome_kinds import FAILURE_KINDS, OUTCOME_KINDS, OUTCOMES
 
 CONVENTIONS = Path(__file__).parents[3] / "CONVENTIONS.md"
 
