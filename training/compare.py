@@ -10,7 +10,7 @@ from __future__ import annotations
 import json
 import statistics
 from collections.abc import Iterable, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass
 from pathlib import Path
 from typing import Any
 
@@ -208,9 +208,7 @@ def _measured(
     queries: Sequence[GraspQuery],
 ) -> Row:
     """A line for a network that was not trained in the folder."""
-    # Their clouds have the protocol's 0.8 mm of noise, which no network's preparation smooths.
-    preparation = replace(predictor.preparation, smooth_above=None)
-    _, of_all = validate(network, list(load_views(validation, preparation)), seed=0)
+    _, of_all = validate(network, list(load_views(validation, predictor.preparation)), seed=0)
     total, of_network = milliseconds(predictor, queries)
     measures = {measure: of_all[measure] for measure in MEASURES}
     return Row(name, [], _parameters(network), measures, {}, total, of_network)
