@@ -15,7 +15,7 @@ from torch import Tensor
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
-from tesnet.obstacles import Obstacles
+from tesnet.points import points_in_grasp_frames
 
 if TYPE_CHECKING:
     from tesnet.candidates import Candidates
@@ -124,18 +124,11 @@ def spans(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> Span:
 def _between_fingers(cloud: PreparedCloud, poses: Tensor, near: Tensor, hand: Gripper) -> tuple[Tensor, Tensor, Tensor]:
     """Candidates (K,), places y (K,) and components of normals along y (K,) of the points between the open fingers."""
     half = hand.finger_breadth / 2 + _BESIDE
-    between = ((0.0, 0.0, hand.palm_front), (half, hand.max_width, hand.tip_offset))
-    found = []
-    for rows, index, (x, y, z) in Obstacles.of(cloud.points).near(poses, [between]):
-        inside = (x.abs() <= half) & (z >= hand.palm_front) & (z <= hand.tip_offset)
-        inside &= (y <= near[rows] + _BIN) & (y >= near[rows] - hand.max_width)
-        row = rows[inside]
-        found.append((row, y[inside], (cloud.normals[index[inside]] * poses[row, :3, 1]).sum(dim=1)))
-    if not found:
-        nothing = torch.zeros(0, dtype=poses.dtype, device=poses.device)
-        return nothing.long(), nothing, nothing
-    every_row, every_y, every_n = (torch.cat(parts) for parts in zip(*found, strict=True))
-    return every_row, every_y, every_n
+    x, y, z = points_in_grasp_frames(cloud.points, poses)
+    inside = (x.abs_() <= half) & (z >= hand.palm_front) & (z <= hand.tip_offset)
+    inside &= (y <= near[:, None] + _BIN) & (y >= near[:, None] - hand.max_width)
+    row, index = inside.nonzero(as_tuple=True)
+    return row, y[row, index], (cloud.normals[index] * poses[row, :3, 1]).sum(dim=1)
 
 
 def _last_before_gap(row: Tensor, depth: Tensor, count: int, hand: Gripper) -> Tensor:
