@@ -113,9 +113,9 @@ class Candidates:
             self.approach[which], self.contact[which], self.Ts_canonical_grasp[which], self.widths[which], self.gripper
         )
 
-    def openings(self, hand: Gripper) -> NDArray[np.float64]:
+    def openings(self) -> NDArray[np.float64]:
         """(C,) the widths as the hand is told them: micrometres, and no wider than it opens."""
-        widths: NDArray[np.float64] = np.minimum(self.widths.cpu().double().numpy().round(6), hand.max_width)
+        widths: NDArray[np.float64] = np.minimum(self.widths.cpu().double().numpy().round(6), self.gripper.max_width)
         return widths
 
     def joined_by(self, others: Candidates) -> Candidates:
@@ -226,7 +226,7 @@ def _search(
 
 def _fitted(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates) -> Candidates:
     """The candidates as wide as asked and midway between their walls, but for those that would come too low there."""
-    moved = fitted(cloud, candidates, query.gripper, centred=config.centred, policy=query.width)
+    moved = fitted(cloud, candidates, centred=config.centred, policy=query.width)
     before, after = (
         hand_clearance(cloud, some.Ts_canonical_grasp, query.gripper, some.widths) for some in (candidates, moved)
     )
@@ -250,7 +250,7 @@ def _judge(
     cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates
 ) -> tuple[Candidates, Tensor, dict[str, int]]:
     """The candidates, clear of the support, a mask of those that no rule drops, and how many each rule does."""
-    candidates, too_near = clear_of_support(cloud, candidates, query.gripper, config)
+    candidates, too_near = clear_of_support(cloud, candidates, config)
     poses = candidates.Ts_canonical_grasp
     masks = {
         "from_below": _comes_from_behind(cloud, candidates, config),
@@ -267,10 +267,10 @@ def _judge(
 
 
 def clear_of_support(
-    cloud: PreparedCloud, candidates: Candidates, hand: Gripper, config: CandidateConfig
+    cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig
 ) -> tuple[Candidates, Tensor]:
     """The candidates, those stopped short that come too near to the support, and a mask of those that still do."""
-    poses = candidates.Ts_canonical_grasp
+    poses, hand = candidates.Ts_canonical_grasp, candidates.gripper
     clearance = hand_clearance(cloud, poses, hand, candidates.widths)
     if cloud.up is None or cloud.support_height is None:
         return candidates, torch.zeros_like(clearance, dtype=torch.bool)
@@ -471,19 +471,14 @@ def poses_along(
     travel: Tensor,
     *,
     hand: Gripper = PANDA,
-    widths: Tensor | None = None,
 ) -> Tensor:
     """TCP poses (C, 4, 4) of pairs of points (C, 3) whose unit directions of closing and travel (C, 3) are known.
 
-    Those of `grasp_poses` where the directions are; depth is measured along the travel. The hand is open by `widths`
-    (C,), or as wide as it opens.
+    Those of `grasp_poses` where the directions are; depth is measured along the travel.
     """
     d = contact_points - approach_points
     along, depth = ((d * direction).sum(dim=1, keepdim=True) for direction in (closing, travel))
-    poses = _poses(approach_points, travel, closing, depth, along, hand)
-    if widths is not None and hand.linkage_length is not None:
-        poses[:, :3, 3] += (hand.tcp_at(widths) - hand.hand_to_tcp)[:, None] * travel
-    return poses
+    return _poses(approach_points, travel, closing, depth, along, hand)
 
 
 def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor, along: Tensor, hand: Gripper) -> Tensor:

@@ -47,7 +47,6 @@ _STRIDES = (400, 20, 1)
 def blocked(
     cloud: PreparedCloud,
     candidates: Candidates,
-    gripper: Gripper,
     unseen: Literal["free", "occupied"],
     between: Callable[[], None] = lambda: None,
 ) -> Tensor:
@@ -58,15 +57,14 @@ def blocked(
     Args:
         cloud: what was observed.
         candidates: C of them.
-        gripper: the hand.
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
         between: called between blocks of work of some milliseconds.
     """
-    poses, widths = candidates.Ts_canonical_grasp, candidates.widths
+    poses, widths, gripper = candidates.Ts_canonical_grasp, candidates.widths, candidates.gripper
     mask = in_collision(cloud.points, poses, gripper, widths, APPROACH_DISTANCE, between)
     if cloud.unsought is not None:
-        mask |= _meets(cloud.unsought, candidates, gripper, ~mask, between)
-    unsafe = _meets(Obstacles.of(beyond(cloud)), candidates, gripper, ~mask, between)
+        mask |= _meets(cloud.unsought, candidates, ~mask, between)
+    unsafe = _meets(Obstacles.of(beyond(cloud)), candidates, ~mask, between)
     if not bool((mask | unsafe).all()):
         mask |= unsafe
     if unseen == "occupied":
@@ -75,23 +73,22 @@ def blocked(
     return mask
 
 
-def _meets(
-    obstacles: Obstacles, candidates: Candidates, gripper: Gripper, asked: Tensor, between: Callable[[], None]
-) -> Tensor:
+def _meets(obstacles: Obstacles, candidates: Candidates, asked: Tensor, between: Callable[[], None]) -> Tensor:
     """Mask (C,) of the candidates, among those asked about (C,), whose hand meets an obstacle on its way."""
     met = torch.zeros_like(asked)
     # A large hand in a dense cloud holds a hundred thousand obstacles, of which one tells that it does.
     for stride in _STRIDES:
-        some = Obstacles.of(obstacles.points[::stride])
+        some = obstacles if stride == 1 else Obstacles.of(obstacles.points[::stride])
         open_rows = (asked & ~met).nonzero()[:, 0]
-        poses, widths = candidates.Ts_canonical_grasp[open_rows], candidates.widths[open_rows]
-        met[open_rows] = some.count_in_hands(poses, gripper, widths, distance=APPROACH_DISTANCE, between=between) > 0
+        hands = candidates.select(open_rows)
+        found = some.count_in_hands(
+            hands.Ts_canonical_grasp, hands.gripper, hands.widths, distance=APPROACH_DISTANCE, between=between
+        )
+        met[open_rows] = found > 0
     return met
 
 
-def holds(
-    posted: Obstacles, candidates: Candidates, gripper: Gripper, between: Callable[[], None] = lambda: None
-) -> Tensor:
+def holds(posted: Obstacles, candidates: Candidates, between: Callable[[], None] = lambda: None) -> Tensor:
     """Mask (C,): posted points lie well inside the open hand at the grasp, `HELD_POINTS` or more `HELD_DEPTH` deep.
 
     The last word on grasps that are to be returned: `blocked` looks at cells, and leaves out points that stand alone.
@@ -99,15 +96,16 @@ def holds(
     Args:
         posted: every point of the query that is in reach of the hands, its support's included.
         candidates: C of them.
-        gripper: the hand.
         between: called between blocks of work of some milliseconds.
     """
     poses, widths = candidates.Ts_canonical_grasp, candidates.widths
-    return posted.count_in_hands(poses, gripper, widths, depth=HELD_DEPTH, between=between) >= HELD_POINTS
+    held = posted.count_in_hands(poses, candidates.gripper, widths, depth=HELD_DEPTH, between=between)
+    return held >= HELD_POINTS
 
 
-def in_reach(posted: Tensor, Ts_canonical_grasp: Tensor, gripper: Gripper) -> Obstacles:
-    """Those of the posted points (N, 3) that hands at the grasps (C, 4, 4), one at least, may hold."""
+def in_reach(posted: Tensor, candidates: Candidates) -> Obstacles:
+    """Those of the posted points (N, 3) that the hands of the candidates, one at least, may hold."""
+    Ts_canonical_grasp, gripper = candidates.Ts_canonical_grasp, candidates.gripper
     corners = torch.tensor(gripper.corners(gripper.max_width), dtype=posted.dtype, device=posted.device)
     places = corners @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
     near = ((posted >= places.amin(dim=(0, 1))) & (posted <= places.amax(dim=(0, 1)))).all(dim=1)

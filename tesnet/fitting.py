@@ -68,7 +68,6 @@ class Span:
 def fitted(
     cloud: PreparedCloud,
     candidates: Candidates,
-    hand: Gripper,
     *,
     centred: bool = True,
     policy: Literal["fitted", "full"] = "full",
@@ -80,7 +79,7 @@ def fitted(
     """
     if len(candidates) == 0 or (policy == "full" and not centred):
         return candidates
-    span = spans(cloud, candidates, hand)
+    hand, span = candidates.gripper, spans(cloud, candidates)
     middle = (span.near + span.far) / 2
     shift = middle if centred else torch.zeros_like(middle)
     extent = (span.near - span.far + 2 * (middle - shift).abs()).clamp(0.0, hand.max_width)
@@ -97,7 +96,7 @@ def fitted(
     return replace(candidates, Ts_canonical_grasp=poses, widths=widths)
 
 
-def spans(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> Span:
+def spans(cloud: PreparedCloud, candidates: Candidates) -> Span:
     """Where the walls lie that the hand will close on.
 
     The near one is that of the contact point. From there what was seen between the fingers is followed until a gap in
@@ -105,7 +104,7 @@ def spans(cloud: PreparedCloud, candidates: Candidates, hand: Gripper) -> Span:
     y = m + r n holds for the places y and the components n of the normals along the closing direction, with m its
     middle and r its radius, so the line through them tells where it ends. That counts where it is beyond what was seen.
     """
-    poses = candidates.Ts_canonical_grasp
+    poses, hand = candidates.Ts_canonical_grasp, candidates.gripper
     near = ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
     row, y, n = _between_fingers(cloud, poses, near, hand)
     end = _last_before_gap(row, near[row] - y, len(near), hand)

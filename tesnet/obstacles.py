@@ -1,4 +1,4 @@
-"""Points that a hand may meet, sorted into blocks so that each hand is held against those near it alone.
+"""Points that a hand must not meet, sorted into blocks so that each hand is held against those near it alone.
 
 Knows no query and no network. Vectorised torch; lengths in metres; points and poses in one frame.
 """
@@ -29,13 +29,11 @@ class Obstacles:
 
     Args:
         points: (O, 3), the points of a block one after the other.
-        index: (O,) which of the points given each is.
         first, count: (B,) where a block begins and how many points it has.
         centres, radii: (B, 3) and (B,) of a sphere about each block's points.
     """
 
     points: Tensor
-    index: Tensor
     first: Tensor
     count: Tensor
     centres: Tensor
@@ -46,7 +44,7 @@ class Obstacles:
         """The points (O, 3) in blocks."""
         if len(points) == 0:
             none = torch.zeros(0, dtype=torch.long, device=points.device)
-            return cls(points, none, none, none, points, points.new_zeros(0))
+            return cls(points, none, none, points, points.new_zeros(0))
         block, count = members_of_cells((points / BLOCK_SIZE).floor().long())
         order = block.argsort(stable=True)
         points, block = points[order], block[order]
@@ -56,7 +54,7 @@ class Obstacles:
         high = points.new_zeros(len(count), 3).scatter_reduce(
             0, block[:, None].expand(-1, 3), points, "amax", include_self=False
         )
-        return cls(points, order, count.cumsum(0) - count, count, (low + high) / 2, (high - low).norm(dim=1) / 2)
+        return cls(points, count.cumsum(0) - count, count, (low + high) / 2, (high - low).norm(dim=1) / 2)
 
     def __len__(self) -> int:
         return len(self.points)
@@ -86,16 +84,16 @@ class Obstacles:
             return found
         widths = torch.as_tensor(widths, dtype=poses.dtype, device=poses.device).expand(len(poses))
         boxes = boxes_of(gripper, float(widths.min()), float(widths.max()), distance)
-        for row, _, local in self.near(poses, boxes, between):
+        for row, local in self._near(poses, boxes, between):
             found.index_add_(0, row, inside_hand(*local, gripper, widths[row], distance, depth).long())
         return found
 
-    def near(
+    def _near(
         self,
         poses: Tensor,
         boxes: Sequence[tuple[Sequence[float], Sequence[float]]],
-        between: Callable[[], None] = lambda: None,
-    ) -> Iterator[tuple[Tensor, Tensor, tuple[Tensor, Tensor, Tensor]]]:
+        between: Callable[[], None],
+    ) -> Iterator[tuple[Tensor, tuple[Tensor, Tensor, Tensor]]]:
         """The points of the blocks that a box in the frame of each pose touches, many poses at a time.
 
         Args:
@@ -104,8 +102,7 @@ class Obstacles:
             between: called between blocks of work of some milliseconds.
 
         Yields:
-            (K,) numbers of poses, (K,) which of the points given, and x, y and z, each (K,), of that point in the frame
-            of that pose.
+            (K,) numbers of poses, and x, y and z, each (K,), of a point in the frame of that pose.
         """
         if len(self) == 0:
             return
@@ -118,8 +115,8 @@ class Obstacles:
             while begin < len(row):
                 done = int(total[begin - 1]) if begin else 0
                 stop = max(begin + 1, int(torch.searchsorted(total, done + _PAIRS_AT_ONCE, right=True)))
-                pose_of, point = self._pairs(row[begin:stop], block[begin:stop])
-                yield first + pose_of, self.index[point], _in_grasp_frames(self.points[point], some[pose_of])
+                pose_of, points = self._pairs(row[begin:stop], block[begin:stop])
+                yield first + pose_of, _in_grasp_frames(points, some[pose_of])
                 begin = stop
                 between()
 
@@ -136,11 +133,11 @@ class Obstacles:
         return touching.nonzero(as_tuple=True)
 
     def _pairs(self, row: Tensor, block: Tensor) -> tuple[Tensor, Tensor]:
-        """The rows (K,) of all points (K,) of the blocks, row by row."""
+        """The rows (K,) of all points (K, 3) of the blocks, row by row."""
         count = self.count[block]
         start = count.cumsum(0) - count
         within = torch.arange(int(count.sum()), device=row.device) - start.repeat_interleave(count)
-        return row.repeat_interleave(count), self.first[block].repeat_interleave(count) + within
+        return row.repeat_interleave(count), self.points[self.first[block].repeat_interleave(count) + within]
 
 
 def _in_grasp_frames(points: Tensor, poses: Tensor) -> tuple[Tensor, Tensor, Tensor]:

@@ -229,7 +229,7 @@ class GraspPredictor:
         clock.check()
         found, rejected = candidates.generate(prepared, query, self._candidates, edges, clock.check)
         clock.check()
-        blocked = collision.blocked(prepared, found, query.gripper, query.unseen, clock.check)
+        blocked = collision.blocked(prepared, found, query.unseen, clock.check)
         return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
 
     def _encode(self, proposals: Sequence[_Proposal]) -> list[Any]:
@@ -400,11 +400,11 @@ def _ranked_clear(
 
     Grasps are held against the points as they come to be ranked; from the `_RANKINGS`th time on, all of them.
     """
-    obstacles = collision.in_reach(posted, found.free.Ts_canonical_grasp, query.gripper)
+    obstacles = collision.in_reach(posted, found.free)
     for number in itertools.count(1):
         ranked = _ranked(found, scores, query)
         asked = (ranked.indices if number < _RANKINGS else torch.arange(len(scores))).to(scores.device)
-        held = collision.holds(obstacles, found.free.select(asked), query.gripper, clock.check)
+        held = collision.holds(obstacles, found.free.select(asked), clock.check)
         if not bool(held.any()):
             break
         clear = torch.ones(len(scores), dtype=torch.bool, device=scores.device)
@@ -545,7 +545,7 @@ def _grasps(
     return GraspSet(
         scores=scores[indices.to(scores.device)].cpu().double().numpy(),
         Ts_cloud_grasp=to_cloud.matrix @ chosen.Ts_canonical_grasp.cpu().double().numpy(),
-        widths=chosen.openings(query.gripper),
+        widths=chosen.openings(),
         approach_points=to_cloud.apply(prepared.points[chosen.approach].cpu().numpy()),
         contact_points=to_cloud.apply(prepared.points[chosen.contact].cpu().numpy()),
         gripper=query.gripper,

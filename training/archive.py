@@ -261,7 +261,7 @@ def _from_elsewhere(
     if shown is None:
         return None
     seen = shown.only((_shifts(shown, everything.places) < LARGEST_SHIFT).all(dim=1))
-    return replace(seen, collision_free=~blocked(seen.cloud, seen.candidates, seen.gripper, "free"))
+    return replace(seen, collision_free=~blocked(seen.cloud, seen.candidates, "free"))
 
 
 def _shifts(view: LabelledView, places: NDArray[np.float64]) -> torch.Tensor:

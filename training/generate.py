@@ -300,7 +300,7 @@ def _label_view(
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
     found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
-    free = ~blocked(prepared, found, query.gripper, query.unseen)
+    free = ~blocked(prepared, found, query.unseen)
     chosen = _choose(prepared, found, free, config, rng, judge.network)
     if len(chosen) == 0:
         return None
@@ -308,7 +308,7 @@ def _label_view(
     picked = found.select(which)
     Ts_world_grasp = prepared.T_cloud_canonical.matrix @ picked.Ts_canonical_grasp.double().numpy()
     with snapshot_of(world) as snapshot:
-        kinds = label_strict(world, hand, Ts_world_grasp, picked.openings(hand.gripper), snapshot)
+        kinds = label_strict(world, hand, Ts_world_grasp, picked.openings(), snapshot)
     return LabelledView(
         cloud=prepared,
         poses=picked.Ts_canonical_grasp,

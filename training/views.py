@@ -213,7 +213,7 @@ def _whole(rows: torch.Tensor) -> torch.Tensor:
 
 
 def _poses_of_pairs(pairs: torch.Tensor, gripper: Gripper) -> torch.Tensor:
-    """Poses of the wide open hand in files of before 0.6.0.
+    """Poses of the wide open hand in files that hold pairs instead of poses.
 
     Args:
         pairs: (C, 4, 3) approach point, contact point, and directions of closing and travel.

@@ -129,7 +129,7 @@ def blocked_beside_the_side(*ys: float) -> list[bool]:
     Ts = np.tile(np.eye(4), (len(ys), 1, 1))
     Ts[:, 1, 3] = ys
     hands = open_hands(torch.from_numpy(Ts).float())
-    found: list[bool] = collision.blocked(bare_cloud(STRIP, sides=SIDE), hands, PANDA, "free").tolist()
+    found: list[bool] = collision.blocked(bare_cloud(STRIP, sides=SIDE), hands, "free").tolist()
     return found
 
 
@@ -154,8 +154,8 @@ def test_the_shadow_blocks_where_it_counts_as_occupied() -> None:
     Ts = torch.from_numpy(HAND_ALONG_X[None]).float()
     Ts[0, 2, 3] = -0.3
     hands = open_hands(Ts)
-    assert not collision.blocked(bare_cloud(SQUARE, ABOVE[None]), hands, PANDA, "free").any()
-    assert collision.blocked(bare_cloud(SQUARE, ABOVE[None]), hands, PANDA, "occupied").all()
+    assert not collision.blocked(bare_cloud(SQUARE, ABOVE[None]), hands, "free").any()
+    assert collision.blocked(bare_cloud(SQUARE, ABOVE[None]), hands, "occupied").all()
 
 
 # The shadow of a square of 20 x 20 cm at z = 0, spacing 4 mm, seen from straight above.
@@ -229,13 +229,14 @@ def scattered(seed: int, hand: Gripper, poses: int = 40) -> tuple[Array, Array, 
     return points, Ts, rng.uniform(0.1, 1.0, poses) * hand.max_width
 
 
-def opened(Ts: Array, widths: Array) -> candidates.Candidates:
+def opened(Ts: Array, widths: Array, hand: Gripper) -> candidates.Candidates:
     """Hands at poses (C, 4, 4), open by widths (C,)."""
-    return replace(open_hands(torch.from_numpy(Ts).float()), widths=torch.from_numpy(widths).float())
+    hands = open_hands(torch.from_numpy(Ts).float())
+    return replace(hands, widths=torch.from_numpy(widths).float(), gripper=hand)
 
 
 def judged(cloud: PreparedCloud, Ts: Array, widths: Array, hand: Gripper) -> Array:
-    found: Array = collision.blocked(cloud, opened(Ts, widths), hand, "free").numpy()
+    found: Array = collision.blocked(cloud, opened(Ts, widths, hand), "free").numpy()
     return found
 
 
@@ -302,8 +303,8 @@ def test_each_part_of_the_hand_that_is_asked_for_is_looked_for_in_the_shadow(
     along = np.arange(-0.02, 0.0201, 0.002)
     square = np.stack([*np.meshgrid(along, along), np.full((len(along), len(along)), 0.03)], axis=2).reshape(-1, 3)
     cloud = bare_cloud(square, np.array([[0.0, 0.0, 3.0]]))
-    hands = opened(np.stack([T, aside]), np.array([width, width]))
-    alone = collision.blocked(cloud, hands.select(torch.tensor([1])), hand, "free")
+    hands = opened(np.stack([T, aside]), np.array([width, width]), hand)
+    alone = collision.blocked(cloud, hands.select(torch.tensor([1])), "free")
     assert alone.tolist() == [False]
     assert collision.in_shadow(cloud, hands.Ts_canonical_grasp, hand, hands.widths).tolist() == [True, False]
-    assert collision.blocked(cloud, hands, hand, "occupied").tolist() == [True, False]
+    assert collision.blocked(cloud, hands, "occupied").tolist() == [True, False]

@@ -66,7 +66,7 @@ def test_a_fitted_hand_opens_by_what_it_holds_and_a_margin_and_never_wider_than_
         wanted = min(width + 2 * fitting.MARGIN, PANDA.max_width)
         assert np.abs(np.median(found.widths.numpy()) - wanted) < 0.004
         assert float(found.widths.max()) <= PANDA.max_width + 1e-9
-        assert (found.openings(PANDA) <= PANDA.max_width).all()
+        assert (found.openings() <= PANDA.max_width).all()
         assert (towards_y(cloud).widths == torch.tensor(PANDA.max_width)).all()
 
 

@@ -444,8 +444,8 @@ def test_what_the_workspace_hides_is_met_on_the_way() -> None:
     down = np.diag([1.0, -1.0, -1.0, 1.0])
     down[:3, 3] = [0.0, 0.0, 0.15]
     hand = open_hands(torch.from_numpy((prepared.T_cloud_canonical.inverse().matrix @ down)[None]).float())
-    assert collision.blocked(prepared, hand, PANDA, "free").all()
-    assert not collision.blocked(replace(prepared, unsought=None), hand, PANDA, "free").any()
+    assert collision.blocked(prepared, hand, "free").all()
+    assert not collision.blocked(replace(prepared, unsought=None), hand, "free").any()
 
 
 def test_points_that_stand_alone_and_the_supports_own_block_nothing() -> None:
@@ -467,4 +467,4 @@ def test_a_collision_check_can_be_left_in_its_middle(monkeypatch: pytest.MonkeyP
     ready = cloud.prepare(tabletop_query(), predictor().preparation, torch.device("cpu"))
     assert ready is not None
     with pytest.raises(GaveUp):
-        collision.blocked(ready, open_hands(torch.eye(4).expand(5000, 4, 4)), PANDA, "free", between)
+        collision.blocked(ready, open_hands(torch.eye(4).expand(5000, 4, 4)), "free", between)

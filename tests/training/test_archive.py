@@ -13,7 +13,6 @@ from simharness.sim.protocol import query_about
 from tesnet import weights
 from tesnet.cloud import PreparationConfig, prepare
 from tesnet.collision import blocked
-from tesnet.geometry import PANDA
 from tesnet.predictor import GraspPredictor
 from tesnet.query import GraspQuery
 from training import archive, viewing
@@ -87,7 +86,7 @@ def surely_free(view: LabelledView) -> tuple[torch.Tensor, torch.Tensor]:
     generator = torch.Generator().manual_seed(0)
     noise = 2e-4 * torch.rand(16, *view.cloud.points.shape, generator=generator) - 1e-4
     clouds = [replace(view.cloud, points=view.cloud.points + moved) for moved in noise]
-    votes = torch.stack([~blocked(cloud, view.candidates, PANDA, "free") for cloud in clouds])
+    votes = torch.stack([~blocked(cloud, view.candidates, "free") for cloud in clouds])
     return votes[0], (votes == votes[0]).all(dim=0)
 
 
