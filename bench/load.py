@@ -14,7 +14,7 @@ import http.client
 import threading
 import time
 from collections import Counter
-from collections.abc import Coroutine, Iterator
+from collections.abc import Callable, Coroutine, Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass, field
 from typing import Any
@@ -152,9 +152,8 @@ def measured(url: str, sending: Coroutine[Any, Any, Outcome]) -> Outcome:
 def probing(url: str) -> Iterator[list[float]]:
     """Milliseconds of `GET /health/live`, asked in a thread for as long as the context lasts."""
     samples: list[float] = []
-    ended = threading.Event()
 
-    def probe() -> None:
+    def probe(ended: threading.Event) -> None:
         connection = http.client.HTTPConnection(url.removeprefix("http://"), timeout=60)
         while not ended.wait(HEALTH_PERIOD_S):
             start = time.perf_counter()
@@ -163,10 +162,18 @@ def probing(url: str) -> Iterator[list[float]]:
             samples.append(1e3 * (time.perf_counter() - start))
         connection.close()
 
-    thread = threading.Thread(target=probe)
+    with beside(probe):
+        yield samples
+
+
+@contextmanager
+def beside(work: Callable[[threading.Event], None]) -> Iterator[None]:
+    """Work in a thread for as long as the context lasts, after which the event that it is given is set."""
+    ended = threading.Event()
+    thread = threading.Thread(target=work, args=(ended,))
     thread.start()
     try:
-        yield samples
+        yield
     finally:
         ended.set()
         thread.join()

@@ -18,7 +18,7 @@ from contextlib import contextmanager
 from itertools import count
 
 from bench.fuzz import Findings, attack
-from bench.load import Load, Outcome, percentiles
+from bench.load import Load, Outcome, beside, percentiles
 from bench.serve import memory_mb, running_service
 from bench.table import processor
 from client import GraspClient
@@ -35,9 +35,9 @@ REFUSALS = (429, 503, 504)
 @contextmanager
 def attacked(url: str, seed: int) -> Iterator[Findings]:
     """Hostile requests, one after the other, for as long as the context lasts, and what came of them."""
-    ended, all_findings = threading.Event(), Findings()
+    all_findings = Findings()
 
-    def keep_attacking() -> None:
+    def keep_attacking(ended: threading.Event) -> None:
         for number in count(seed):
             if ended.is_set():
                 return
@@ -45,13 +45,8 @@ def attacked(url: str, seed: int) -> Iterator[Findings]:
             all_findings.statuses += found.statuses
             all_findings.wrong += found.wrong
 
-    thread = threading.Thread(target=keep_attacking)
-    thread.start()
-    try:
+    with beside(keep_attacking):
         yield all_findings
-    finally:
-        ended.set()
-        thread.join()
 
 
 @contextmanager
