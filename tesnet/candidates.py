@@ -20,7 +20,6 @@ from torch import Tensor
 
 from tesnet.clearance import stopping_short
 from tesnet.cloud import PreparedCloud
-from tesnet.fitting import fitted
 from tesnet.geometry import PANDA, Gripper
 from tesnet.outline import Outline, is_low, outline
 from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
@@ -46,9 +45,6 @@ _NEARLY_FARTHEST = 0.7
 
 _PAIRS_AT_ONCE = 500_000
 """Pairs of points whose offsets are in memory at a time, some 20 MB."""
-
-_FITTED_AT_ONCE = 250
-"""Candidates whose walls are looked for at a time: a large hand has thousands of points between its fingers."""
 
 MOST_PAIRS = 500_000
 """Of more pairs in reach so many are tried, spread evenly: hands with very long fingers reach millions."""
@@ -173,11 +169,7 @@ def generate(
     if len(survivors) > query.most_candidates:
         chosen = torch.randperm(len(survivors), generator=generator)[: query.most_candidates].sort().values
         survivors = survivors[chosen.to(survivors.device)]
-    found = _no_candidates(cloud, query.gripper)
-    for rows in survivors.split(_FITTED_AT_ONCE):
-        between()
-        found = found.joined_by(_fitted(cloud, query, config, candidates.select(rows)))
-    return found, rejected
+    return candidates.select(survivors), rejected
 
 
 def more_approach_points(count: int) -> int:
@@ -222,20 +214,6 @@ def _search(
     between()
     candidates = Candidates(approach, contact, poses, wide_open(poses, query.gripper), query.gripper)
     return _judge(cloud, query, config, candidates)
-
-
-def _fitted(cloud: PreparedCloud, query: GraspQuery, config: CandidateConfig, candidates: Candidates) -> Candidates:
-    """The candidates as wide as asked and midway between their walls, but for those that would come too low there."""
-    moved = fitted(cloud, candidates, centred=config.centred, policy=query.width)
-    before, after = (
-        hand_clearance(cloud, some.Ts_canonical_grasp, query.gripper, some.widths) for some in (candidates, moved)
-    )
-    low = after < before.clamp(max=config.support_clearance) - _ROUNDING
-    return replace(
-        moved,
-        Ts_canonical_grasp=torch.where(low[:, None, None], candidates.Ts_canonical_grasp, moved.Ts_canonical_grasp),
-        widths=torch.where(low, candidates.widths, moved.widths),
-    )
 
 
 def _at_most(limit: int, approach: Tensor, contact: Tensor) -> tuple[Tensor, Tensor]:

@@ -8,17 +8,15 @@ no request. Vectorised torch; lengths in metres; everything in the cloud's canon
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import TYPE_CHECKING, Literal
+from typing import Literal
 
 import torch
 from torch import Tensor
 
+from tesnet.candidates import CandidateConfig, Candidates, hand_clearance
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
 from tesnet.points import points_in_grasp_frames
-
-if TYPE_CHECKING:
-    from tesnet.candidates import Candidates
 
 MARGIN = 0.008
 """Between each finger and the wall that it closes on, where that is seen."""
@@ -47,6 +45,8 @@ _LEAST_SPREAD = 0.02
 
 _FEWEST = 6
 
+_ROUNDING = 1e-5
+
 _FARTHEST_UNSEEN = 0.02
 """No wall is taken to lie farther beyond what is seen."""
 
@@ -68,17 +68,50 @@ class Span:
 def fitted(
     cloud: PreparedCloud,
     candidates: Candidates,
+    config: CandidateConfig,
     *,
-    centred: bool = True,
     policy: Literal["fitted", "full"] = "full",
 ) -> Candidates:
-    """The candidates, midway between the walls where `centred`, the hand as wide as the policy says.
+    """The candidates, midway between their walls where the configuration says so, the hand as wide as the policy says.
 
     `fitted` is what lies between the fingers and a margin beside each, `full` all that the hand opens. A hand whose
-    tips swing forward stands where they come to rest on the walls.
+    tips swing forward stands where they come to rest on the walls. One that would come too low there stays.
     """
-    if len(candidates) == 0 or (policy == "full" and not centred):
+    if len(candidates) == 0 or (policy == "full" and not config.centred):
         return candidates
+    moved = _moved(cloud, candidates, config.centred, policy)
+    before, after = (
+        hand_clearance(cloud, some.Ts_canonical_grasp, some.gripper, some.widths) for some in (candidates, moved)
+    )
+    low = after < before.clamp(max=config.support_clearance) - _ROUNDING
+    return replace(
+        moved,
+        Ts_canonical_grasp=torch.where(low[:, None, None], candidates.Ts_canonical_grasp, moved.Ts_canonical_grasp),
+        widths=torch.where(low, candidates.widths, moved.widths),
+    )
+
+
+def reach_of_fitting(
+    cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig
+) -> tuple[Tensor, Tensor, float]:
+    """How far `fitted` moves each hand along its closing direction, least and most (C,); how far along its travel.
+
+    The least is zero or less.
+    """
+    near, hand = _near_walls(cloud, candidates), candidates.gripper
+    if not config.centred:
+        return torch.zeros_like(near), torch.zeros_like(near), 0.0
+    least = (near - (hand.max_width + _FARTHEST_UNSEEN) / 2).clamp(max=0.0)
+    rise = 0.0
+    if hand.linkage_length is not None:
+        at = hand.tcp_at(torch.linspace(0.0, hand.max_width, 32))
+        rise = 2 * float(at.max() - at.min())
+    return least, near.clamp(min=0.0), rise
+
+
+def _moved(
+    cloud: PreparedCloud, candidates: Candidates, centred: bool, policy: Literal["fitted", "full"]
+) -> Candidates:
     hand, span = candidates.gripper, spans(cloud, candidates)
     middle = (span.near + span.far) / 2
     shift = middle if centred else torch.zeros_like(middle)
@@ -104,8 +137,7 @@ def spans(cloud: PreparedCloud, candidates: Candidates) -> Span:
     y = m + r n holds for the places y and the components n of the normals along the closing direction, with m its
     middle and r its radius, so the line through them tells where it ends. That counts where it is beyond what was seen.
     """
-    poses, hand = candidates.Ts_canonical_grasp, candidates.gripper
-    near = ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
+    poses, hand, near = candidates.Ts_canonical_grasp, candidates.gripper, _near_walls(cloud, candidates)
     row, y, n = _between_fingers(cloud, poses, near, hand)
     end = _last_before_gap(row, near[row] - y, len(near), hand)
     own = near[row] - y <= end[row] + _BIN
@@ -118,6 +150,12 @@ def spans(cloud: PreparedCloud, candidates: Candidates) -> Span:
     goes_on = ~seen & (lean < -_TURNING) & guess.isfinite()
     beyond = torch.minimum(last, guess).clamp(min=last - _FARTHEST_UNSEEN)
     return Span(near, torch.where(goes_on, beyond, last), seen)
+
+
+def _near_walls(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
+    """(C,) places of the contact points along the closing direction from the hand's middle."""
+    poses = candidates.Ts_canonical_grasp
+    return ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
 
 
 def _between_fingers(cloud: PreparedCloud, poses: Tensor, near: Tensor, hand: Gripper) -> tuple[Tensor, Tensor, Tensor]:

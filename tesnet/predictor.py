@@ -21,6 +21,7 @@ from tesnet.outline import Outline, outline
 from tesnet.points import nearest_neighbours
 from tesnet.query import MAX_CANDIDATES, MAX_SEED, NO_VIEWPOINT, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
+from tesnet.search import search
 from tesnet.threads import Threads
 
 COARSEST_RESOLUTION = 0.0005
@@ -225,12 +226,9 @@ class GraspPredictor:
 
     def _search(
         self, prepared: cloud.PreparedCloud, query: GraspQuery, edges: Callable[[], Outline], clock: _Clock
-    ) -> _Found:
-        clock.check()
-        found, rejected = candidates.generate(prepared, query, self._candidates, edges, clock.check)
-        clock.check()
-        blocked = collision.blocked(prepared, found, query.unseen, clock.check)
-        return _Found(found.select(~blocked), len(found), rejected | {"collision": int(blocked.sum())})
+    ) -> _Free:
+        found = search(prepared, query, self._candidates, edges, clock.check)
+        return _Free(found.candidates.select(found.is_free), len(found.candidates), found.rejected)
 
     def _encode(self, proposals: Sequence[_Proposal]) -> list[Any]:
         """The features of each proposal's cloud, whose clock is told its share of the pass."""
@@ -267,7 +265,7 @@ class GraspPredictor:
             timings_ms=clock.laps_ms,
         )
 
-    def _best_search(self, proposal: _Proposal, features: Any) -> tuple[_Found, torch.Tensor]:
+    def _best_search(self, proposal: _Proposal, features: Any) -> tuple[_Free, torch.Tensor]:
         """The search that holds the best score, of the proposal's and, while that scores no candidate well, of others.
 
         With the scores (C,) of its free candidates.
@@ -290,7 +288,7 @@ class GraspPredictor:
                 clock.lap("network")
         return found, scores
 
-    def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Found, clock: _Clock) -> torch.Tensor:
+    def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Free, clock: _Clock) -> torch.Tensor:
         """(F,) of the free candidates, of which so many are scored together that the clock is looked at often."""
         a, b = self._calibration
         logits = []
@@ -340,8 +338,8 @@ class _Clock:
 
 
 @dataclass(frozen=True, eq=False, slots=True)
-class _Found:
-    """What a search found.
+class _Free:
+    """What a search found that meets nothing.
 
     Args:
         free: candidates without collision.
@@ -353,11 +351,11 @@ class _Found:
     count: int
     rejected: dict[str, int]
 
-    def only(self, clear: torch.Tensor) -> _Found:
+    def only(self, clear: torch.Tensor) -> _Free:
         """What is left when of the free candidates only those of the mask (F,) are free after all."""
         blocked = int((~clear).sum())
         rejected = self.rejected | {"collision": self.rejected["collision"] + blocked}
-        return _Found(self.free.select(clear), self.count, rejected)
+        return _Free(self.free.select(clear), self.count, rejected)
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -376,12 +374,12 @@ class _Proposal:
     query: GraspQuery
     prepared: cloud.PreparedCloud
     edges: Callable[[], Outline]
-    found: _Found
+    found: _Free
     notes: list[str]
     clock: _Clock
 
 
-def _ranked(found: _Found, scores: torch.Tensor, query: GraspQuery) -> ranking.Ranking:
+def _ranked(found: _Free, scores: torch.Tensor, query: GraspQuery) -> ranking.Ranking:
     """The ranking of a search's free candidates, whose scores are (F,)."""
     return ranking.rank(
         scores,
@@ -394,8 +392,8 @@ def _ranked(found: _Found, scores: torch.Tensor, query: GraspQuery) -> ranking.R
 
 
 def _ranked_clear(
-    posted: torch.Tensor, found: _Found, scores: torch.Tensor, query: GraspQuery, clock: _Clock
-) -> tuple[_Found, torch.Tensor, ranking.Ranking]:
+    posted: torch.Tensor, found: _Free, scores: torch.Tensor, query: GraspQuery, clock: _Clock
+) -> tuple[_Free, torch.Tensor, ranking.Ranking]:
     """The ranking of grasps that hold none of the posted points (N, 3), and the search and scores that are left.
 
     Grasps are held against the points as they come to be ranked; from the `_RANKINGS`th time on, all of them.
@@ -413,7 +411,7 @@ def _ranked_clear(
     return found, scores, ranked
 
 
-def _why_nothing(found: _Found) -> Reason:
+def _why_nothing(found: _Free) -> Reason:
     """Why a search whose candidates have been scored yields no grasp."""
     return "below_min_score" if len(found.free) else "all_in_collision"
 

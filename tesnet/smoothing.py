@@ -67,12 +67,12 @@ def measured(points: Tensor) -> Noise:
     for block in sample.split(_BLOCK):
         ends = torch.stack([by_x[block[0]] - _FLAT_RADIUS, by_x[block[-1]] + _FLAT_RADIUS])
         first, last = torch.searchsorted(by_x, ends).tolist()
-        slab = cloud[first:last] - cloud[block].mean(dim=0)
+        slab = (cloud[first:last] - cloud[block].mean(dim=0)).float()
         squares = torch.cdist(slab[block - first], slab).square()
         crowds.append((squares <= _LONE_RADIUS**2).sum(dim=1) - 1)
         spreads.append(_covariances(slab, squares <= _FLAT_RADIUS**2))
     others = torch.cat(crowds).double()
-    residuals = smallest_eigenvector(torch.cat(spreads))[0][:, 0].sqrt()
+    residuals = smallest_eigenvector(torch.cat(spreads).double())[0][:, 0].sqrt()
     crowd = float(others.median())
     # Of a sparse cloud every point is alone.
     lone = float((others <= _LONE_SHARE * crowd).double().mean()) if _LONE_SHARE * crowd >= 1 else 0.0
@@ -82,7 +82,7 @@ def measured(points: Tensor) -> Noise:
 def _covariances(points: Tensor, members: Tensor) -> Tensor:
     """(B', 3, 3) of the points (P, 3) of each mask (B, P) that has enough of them, as after a plane's three numbers."""
     counts = members.sum(dim=1)
-    members, counts = members[counts >= _FEWEST].double(), counts[counts >= _FEWEST, None].double()
+    members, counts = members[counts >= _FEWEST].to(points), counts[counts >= _FEWEST, None].to(points)
     means = members @ points / counts
     moments = (members @ (points[:, :, None] * points[:, None, :]).flatten(1) / counts).view(-1, 3, 3)
     scale = counts / (counts - 3)

@@ -33,6 +33,16 @@ def inside_hand(
     return inside
 
 
+def inside_palm(x: Tensor, y: Tensor, z: Tensor, gripper: Gripper, distance: float) -> Tensor:
+    """Mask of the places that lie in what of the hand does not move as it closes, as `inside_hand` has it."""
+    x, y = x.abs(), y.abs()
+    inside = torch.zeros_like(x, dtype=torch.bool)
+    for part in gripper.parts:
+        if not part.side:
+            inside |= _inside_part(part, x, y, z, 0.0, distance, 0.0)
+    return inside
+
+
 def boxes_of(
     gripper: Gripper, narrowest: float, widest: float, distance: float
 ) -> list[tuple[list[float], list[float]]]:

@@ -31,8 +31,8 @@ from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.scene import Variety, describe, make_scene, scales_for
 from simharness.sim.world import World
 from tesnet import candidates, cloud, networks
-from tesnet.collision import blocked
 from tesnet.networks import Network
+from tesnet.search import search
 from tesnet.whole_file import write_whole
 from training.hands import drawn_hand
 from training.viewing import Camera, Viewing, draw_viewing
@@ -299,8 +299,8 @@ def _label_view(
     prepared = cloud.prepare(query, judge.preparation, torch.device("cpu"))
     if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
         return None
-    found, _ = candidates.generate(prepared, query, candidates.CandidateConfig())
-    free = ~blocked(prepared, found, query.unseen)
+    searched = search(prepared, query, candidates.CandidateConfig())
+    found, free = searched.candidates, searched.is_free
     chosen = _choose(prepared, found, free, config, rng, judge.network)
     if len(chosen) == 0:
         return None

@@ -81,7 +81,7 @@ class CloudFeatures:
 class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
-    preparation: ClassVar[PreparationConfig] = PreparationConfig()
+    preparation: ClassVar[PreparationConfig] = PreparationConfig(smooth_above=0.0011)
 
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()

@@ -4,11 +4,12 @@ import numpy as np
 import pytest
 import torch
 
-from tesnet import candidates, fitting
+from tesnet import fitting
 from tesnet.candidates import CandidateConfig, Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
+from tesnet.search import search
 from tests.tesnet.scenes import UP, Array, ask, prepared
 
 ABOVE = np.array([0.05, -0.1, 0.6])
@@ -35,7 +36,7 @@ def slab(width: float, seed: int = 0, *, far_wall: bool = True) -> tuple[Prepare
 def towards_y(cloud: PreparedCloud, hand: Gripper = PANDA, *, centred: bool = True, width: str = "full") -> Candidates:
     """Candidates that close along y on the bar from above, in the frame of its cloud."""
     query = ask(np.zeros((1, 3)), up=UP, support_height=0.0, gripper=hand, width=width, num_approach_points=64)
-    found, _ = candidates.generate(cloud, query, CandidateConfig(centred=centred))
+    found = search(cloud, query, CandidateConfig(centred=centred)).candidates
     Ts = cloud.T_cloud_canonical.matrix @ found.Ts_canonical_grasp.double().numpy()
     return found.select(torch.from_numpy((np.abs(Ts[:, 1, 1]) > 0.99) & (Ts[:, 2, 2] < -0.99)))
 
