@@ -5,7 +5,7 @@ Knows no query, no candidate and no hand. Vectorised torch on the device of its 
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
 
 import torch
 from torch import Tensor
@@ -13,10 +13,10 @@ from torch import Tensor
 _FEW_POINTS = 700
 """Up to so many points are compared with each other, all with all."""
 
-_SLAB_QUERIES = 192
-_SLAB_MARGIN = 0.015
-"""Of more points, so many queries at a time are compared with the points that lie at most so far from them along the
-longest axis."""
+_MARGIN = 0.015
+"""Of more points, queries are compared with the points about them first."""
+
+_SLAB_QUERIES, _STRIP_QUERIES = 384, 64
 
 _LARGEST_TABLE = 4_000_000
 """Distances that are in memory at a time, at most."""
@@ -57,32 +57,23 @@ def nearest_neighbours(
     Queries default to the points themselves; each is then its own first neighbour. With fewer than k points the last
     one is repeated.
 
-    Points and queries are sorted along the points' longest axis, and a block of queries is compared with the slab of
-    points around it only; the few queries whose k-th neighbour may lie outside the slab, and all queries of few points,
-    are compared with all. `between` is called between the blocks.
+    Queries are compared with the points about them only; the few whose k-th neighbour may lie farther away, and all
+    queries of few points, are compared with all. `between` is called between the blocks.
     """
     sources = points if queries is None else queries
     available = min(k, len(points))
     # Squared distances come from an expanded square, whose terms cancel: float64.
     exact, wanted = points.double(), sources.double()
-    longest = int((points.amax(dim=0) - points.amin(dim=0)).argmax())
-    places, order = exact[:, longest].sort()
-    sorted_points = exact[order]
-    query_order = wanted[:, longest].argsort()
     neighbours = torch.empty(len(sources), available, dtype=torch.long, device=points.device)
     few = len(points) <= _FEW_POINTS
-    unsure = [query_order] if few else []
-    for rows in () if few else query_order.split(_SLAB_QUERIES):
-        between()
-        block = wanted[rows]
-        ends = torch.stack([block[0, longest] - _SLAB_MARGIN, block[-1, longest] + _SLAB_MARGIN])
-        first, last = torch.searchsorted(places, ends).tolist()
-        if last - first < available:
+    unsure = [torch.arange(len(sources), device=points.device)] if few else []
+    for rows, around in () if few else strips(exact, wanted, _MARGIN, between):
+        if len(around) < available:
             unsure.append(rows)
             continue
-        squares, found = _nearest(block, sorted_points[first:last], available)
-        neighbours[rows] = order[found + first]
-        unsure.append(rows[squares[:, -1] >= _SLAB_MARGIN**2])
+        squares, found = _nearest(wanted[rows], exact[around], available)
+        neighbours[rows] = around[found]
+        unsure.append(rows[squares[:, -1] >= _MARGIN**2])
     for rows in torch.cat(unsure).split(max(1, _LARGEST_TABLE // len(points))) if unsure else ():
         between()
         neighbours[rows] = _nearest(wanted[rows], exact, available)[1]
@@ -91,12 +82,38 @@ def nearest_neighbours(
     return neighbours if available == k else torch.cat([neighbours, neighbours[:, -1:].expand(-1, k - available)], 1)
 
 
-def _nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Squared distances and indices (Q, k) of the nearest points, both in ascending order of distance."""
-    # |q - p|^2 = [q, |q|^2, 1] . [-2 p, 1, |p|^2]; only the sum is small enough for float32.
+def strips(
+    points: Tensor, queries: Tensor, margin: float, between: Callable[[], None] = lambda: None
+) -> Iterator[tuple[Tensor, Tensor]]:
+    """The rows (R,) of some dozens of queries (Q, 3) near each other, and indices (A,) of the points (P, 3) about them.
+
+    Queries are cut into slabs along the points' longest axis, slabs into strips along the second longest. All points
+    at most `margin` from one of a strip's queries are about them. `between` is called between the slabs.
+    """
+    second, longest = (points.amax(dim=0) - points.amin(dim=0)).argsort()[1:].tolist()
+    places, order = points[:, longest].sort()
+    across_points = points[order, second]
+    for slab in queries[:, longest].argsort().split(_SLAB_QUERIES):
+        between()
+        ends = torch.stack([queries[slab[0], longest] - margin, queries[slab[-1], longest] + margin])
+        first, last = torch.searchsorted(places, ends).tolist()
+        across = across_points[first:last]
+        for rows in slab[queries[slab, second].argsort()].split(_STRIP_QUERIES):
+            low, high = queries[rows[0], second] - margin, queries[rows[-1], second] + margin
+            yield rows, order[first + ((across >= low) & (across <= high)).nonzero()[:, 0]]
+
+
+def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
+    """(Q, P) of queries (Q, 3) from points (P, 3): float64, or their terms cancel."""
+    # |q - p|^2 = [q, |q|^2, 1] . [-2 p, 1, |p|^2]
     left = torch.cat([queries, queries.square().sum(dim=1, keepdim=True), torch.ones_like(queries[:, :1])], dim=1)
     right = torch.cat([-2 * points, torch.ones_like(points[:, :1]), points.square().sum(dim=1, keepdim=True)], dim=1)
-    nearest = (left @ right.T).float().topk(k, largest=False)
+    return left @ right.T
+
+
+def _nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
+    """Squared distances and indices (Q, k) of the nearest points, both in ascending order of distance."""
+    nearest = squared_distances(queries, points).float().topk(k, largest=False)
     return nearest.values, nearest.indices
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import torch
 from torch import Tensor
 
-from tesnet.points import cells_of, nearest_neighbours, smallest_eigenvector
+from tesnet.points import cells_of, nearest_neighbours, smallest_eigenvector, squared_distances, strips
 
 MOST_LONE = 0.0125
 """Share of lone points from which on they are flying pixels. Of quiet clouds 0.4 % are lone, on surfaces at a slant."""
@@ -31,7 +31,6 @@ _QUARTER = 0.25
 
 _FINE, _COARSE = 0.003, 0.005
 """Edges of the cells that are moved, and of those that planes are fitted to."""
-_NEIGHBOURS = 48
 _WIDTHS = (0.006, 0.010)
 _DEVIATIONS = 3.0
 """The window's standard deviation is so many of the noise's, within `_WIDTHS`."""
@@ -112,17 +111,29 @@ def smoothed(table: Tensor, sd: float) -> Tensor:
     width = min(max(_DEVIATIONS * sd, _WIDTHS[0]), _WIDTHS[1])
     fine, _ = cells_of(table, _FINE)
     samples, sizes = cells_of(table[:, :3], _COARSE)
-    near = nearest_neighbours(samples, min(_NEIGHBOURS, len(samples)), fine[:, :3].contiguous())
     points = fine[:, :3].double()
-    offsets = samples.double()[near] - points[:, None]
-    squares = offsets.square().sum(dim=2)
-    weights = sizes[near] * torch.exp(-squares / (2 * width**2)) * (squares <= 4 * width**2)
-    total = weights.sum(dim=1)
+    means, covariances, total = _windows(points, samples.double(), sizes.double(), width)
     kept = total >= _LEAST_WEIGHT * total.median()
-    offsets, weights, total = offsets[kept], weights[kept], total[kept, None]
-    means = (offsets * weights[..., None]).sum(dim=1) / total
-    centred = offsets - means[:, None]
-    covariances = (centred * weights[..., None]).transpose(1, 2) @ centred / total[..., None]
-    _, normals = smallest_eigenvector(covariances)
-    moved = points[kept] + (means * normals).sum(dim=1, keepdim=True) * normals
+    _, normals = smallest_eigenvector(covariances[kept])
+    moved = points[kept] + ((means - points)[kept] * normals).sum(dim=1, keepdim=True) * normals
     return torch.cat([moved.to(table.dtype), fine[kept, 3:]], dim=1)
+
+
+def _windows(points: Tensor, samples: Tensor, sizes: Tensor, width: float) -> tuple[Tensor, Tensor, Tensor]:
+    """Means (P, 3), covariances (P, 3, 3) and weights (P,) of the samples (S, 3) in a window about each point (P, 3).
+
+    A sample weighs its size (S,); the window is a Gaussian of this width and ends at twice the width.
+    """
+    sums = points.new_zeros(len(points), 13)
+    for rows, around in strips(samples, points, 2 * width):
+        middle = points[rows].mean(dim=0)
+        queries, near = points[rows] - middle, samples[around] - middle
+        squares = squared_distances(queries, near)
+        weights = torch.exp(squares / (-2 * width**2)) * (squares <= 4 * width**2)
+        products = (near[:, :, None] * near[:, None, :]).flatten(1)
+        columns = torch.cat([torch.ones_like(near[:, :1]), near, products], dim=1) * sizes[around, None]
+        found = weights @ columns
+        means = found[:, 1:4] / found[:, :1]
+        spread = found[:, 4:] / found[:, :1] - (means[:, :, None] * means[:, None, :]).flatten(1)
+        sums[rows] = torch.cat([found[:, :1], means + middle, spread], dim=1)
+    return sums[:, 1:4], sums[:, 4:].view(-1, 3, 3), sums[:, 0]

@@ -243,3 +243,15 @@ def test_points_are_expressed_in_every_grasps_frame() -> None:
     found = torch.stack(pts.points_in_grasp_frames(torch.from_numpy(points), Ts), dim=2)
     expected = np.array([motion.inverse().apply(points) for motion in motions])
     np.testing.assert_allclose(found, expected, atol=1e-12)
+
+
+@given(count=st.integers(2, 2000), queries=st.integers(1, 1500), margin=st.sampled_from([0.0, 0.01, 0.5]))
+@FEW
+def test_a_strip_knows_every_point_near_its_queries(count: int, queries: int, margin: float) -> None:
+    points, asked = uniform(count, 1).double(), uniform(queries, 2).double()
+    seen = []
+    for rows, around in pts.strips(points, asked, margin):
+        near = (torch.cdist(asked[rows], points) <= margin).any(dim=0)
+        assert set(near.nonzero()[:, 0].tolist()) <= set(around.tolist())
+        seen += rows.tolist()
+    assert sorted(seen) == list(range(queries))

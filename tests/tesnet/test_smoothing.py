@@ -12,7 +12,7 @@ from torch import Tensor
 from tesnet import smoothing
 from tesnet.cloud import PreparationConfig, PreparedCloud, prepare
 from tesnet.geometry import Pose
-from tesnet.points import nearest_neighbours
+from tesnet.points import cells_of, nearest_neighbours
 from tests.tesnet.scenes import CAMERA, CPU, moved_query, tabletop, tabletop_query
 from tests.tesnet.test_support import table
 
@@ -134,3 +134,24 @@ def test_of_a_table_in_view_what_its_noise_lifts_is_dropped(sd: float) -> None:
 
 def test_files_without_the_setting_leave_clouds_as_they_are() -> None:
     assert PreparationConfig(voxel_size=0.0045).smooth_above is None
+
+
+def test_each_point_moves_to_the_weighted_plane_of_all_cells_about_it() -> None:
+    rng = np.random.default_rng(3)
+    rows = torch.from_numpy(np.column_stack([rng.uniform(-0.05, 0.05, (9000, 2)), rng.normal(0, 0.002, 9000)])).float()
+    sd, width = 0.002, 0.006
+    fine, _ = cells_of(rows, 0.003)
+    samples, sizes = cells_of(rows, 0.005)
+    expected = []
+    for point in fine.double():
+        offsets = samples.double() - point
+        squares = offsets.square().sum(dim=1)
+        weights = sizes * torch.exp(-squares / (2 * width**2)) * (squares <= 4 * width**2)
+        mean = (offsets * weights[:, None]).sum(dim=0) / weights.sum()
+        centred = offsets - mean
+        _, axes = torch.linalg.eigh((centred * weights[:, None]).T @ centred)
+        expected.append((point + (mean @ axes[:, 0]) * axes[:, 0], weights.sum()))
+    total = torch.stack([weight for _, weight in expected])
+    kept = total >= 0.25 * total.median()
+    moved = torch.stack([place for place, _ in expected])[kept]
+    torch.testing.assert_close(smoothing.smoothed(rows, sd).double(), moved, atol=1e-6, rtol=0)
