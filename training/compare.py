@@ -170,14 +170,18 @@ def _by_network(runs: Sequence[Run]) -> list[list[Run]]:
     return [[run for run in runs if run.network == name] for name in names]
 
 
+def _shown(network: str) -> str:
+    """A trained network's name in the table and the figure; the product's is told from the weights that are shipped."""
+    return "tesnet (same data)" if network == "tesnet" else network
+
+
 def _trained(runs: Sequence[Run], queries: Sequence[GraspQuery]) -> Row:
     first = runs[0]
     measured = [run.training["validation_with_blocked"] for run in runs]
-    name = "tesnet (same data)" if first.network == "tesnet" else first.network
     values = {measure: [of_run[measure] for of_run in measured] for measure in MEASURES}
     total, of_network = milliseconds(GraspPredictor.load(first.path), queries)
     return Row(
-        name=name,
+        name=_shown(first.network),
         seeds=[run.training["seed"] for run in runs],
         parameters=_parameters(networks.load(first.path)[0]),
         measures={measure: statistics.fmean(of_runs) for measure, of_runs in values.items()},
@@ -247,7 +251,7 @@ def panels(runs: Sequence[Run]) -> list[Panel]:
         found = {}
         for of_one in _by_network(runs):
             shortest = min(len(run.epochs) for run in of_one)
-            found[of_one[0].network] = [
+            found[_shown(of_one[0].network)] = [
                 factor * statistics.fmean(run.epochs[epoch]["with_blocked"][measure] for run in of_one)
                 for epoch in range(shortest)
             ]
