@@ -138,8 +138,10 @@ def in_reach(posted: Tensor, candidates: Candidates) -> Obstacles:
     Ts_canonical_grasp, gripper = candidates.Ts_canonical_grasp, candidates.gripper
     corners = torch.tensor(gripper.corners(gripper.max_width), dtype=posted.dtype, device=posted.device)
     places = corners @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
-    near = ((posted >= places.amin(dim=(0, 1))) & (posted <= places.amax(dim=(0, 1)))).all(dim=1)
-    return Obstacles.of(posted[near])
+    low, high = places.amin(dim=(0, 1)), places.amax(dim=(0, 1))
+    for axis in range(3):
+        posted = posted[(posted[:, axis] >= low[axis]) & (posted[:, axis] <= high[axis])]
+    return Obstacles.of(posted)
 
 
 def in_collision(

@@ -281,11 +281,15 @@ class RegionPooling(nn.Module):
         x, y, z = points_in_grasp_frames(points[shuffled], poses)
         breadth, length, behind, ahead = region_about(self.region, candidates)
         within = (x.abs_() < breadth) & (y.abs_() < length[:, None]) & (z > -behind) & (z < ahead)
-        rank = within.cumsum(dim=1, dtype=torch.int32)
-        row, column = (within & (rank <= self.count)).nonzero(as_tuple=True)
-        index = shuffled[within.to(torch.uint8).argmax(dim=1)][:, None].repeat(1, self.count)
-        index[row, (rank[row, column] - 1).long()] = shuffled[column]
-        return RegionMembers(index, rank[:, -1])
+        row, column = within.nonzero(as_tuple=True)
+        total = torch.bincount(row, minlength=len(poses))
+        start = total.cumsum(0) - total
+        first = torch.cat([column, column.new_zeros(1)])[start]  # of regions that hold nothing, some point's
+        index = shuffled[first][:, None].repeat(1, self.count)
+        rank = torch.arange(len(row), device=row.device) - start[row]
+        kept = rank < self.count
+        index[row[kept], rank[kept]] = shuffled[column[kept]]
+        return RegionMembers(index, total)
 
 
 class Told(nn.Module):
