@@ -1,9 +1,9 @@
 """The worst legal requests, in time and memory: `python -m bench.worst`.
 
 Each is predicted, or decoded, in a process of its own by one thread; its time is told as a multiple of what
-`bench.predict` takes for 20,000 points in the same sitting, its memory as what the process needed more than before, and
-as unseen the longest time in which a prediction did not look whether anybody waits for it. What is tried follows from
-the limits and from the types of `tesnet.query.GraspQuery`, so that a new option is tried as well.
+`bench.predict` takes for 20,000 points in the same sitting with the default weights, its memory as what the process
+needed more than before, and as unseen the longest time in which a prediction did not look whether anybody waits for it.
+What is tried follows from the limits and from the types of `tesnet.query.GraspQuery`, so that a new option is tried.
 """
 
 from __future__ import annotations
@@ -18,6 +18,7 @@ import time
 from collections.abc import Callable, Mapping
 from dataclasses import fields, replace
 from functools import partial
+from pathlib import Path
 from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
@@ -158,7 +159,7 @@ def bodies() -> Mapping[str, tuple[str, Callable[[], bytes]]]:
     }
 
 
-def measure(name: str) -> dict[str, float]:
+def measure(name: str, weights: Path) -> dict[str, float]:
     """Seconds and MB of one case, in this process."""
     if name in bodies():
         content_type, make = bodies()[name]
@@ -167,7 +168,7 @@ def measure(name: str) -> dict[str, float]:
         with contextlib.suppress(ServiceError, TesnetError):
             decoder_for(content_type)(body, MOST_POINTS)
         return {"seconds": time.perf_counter() - started, "mb": memory_mb(os.getpid(), "VmHWM") - before}
-    predictor = GraspPredictor.load(default_weights(), num_threads=1)
+    predictor = GraspPredictor.load(weights, num_threads=1)
     predictor.warm_up()
     asked, looks = queries()[name](), [time.perf_counter()]
 
@@ -190,9 +191,10 @@ def main() -> None:
     parser = argparse.ArgumentParser(description=__doc__, formatter_class=argparse.ArgumentDefaultsHelpFormatter)
     parser.add_argument("--case", help="measure this one here and print JSON")
     parser.add_argument("--only", default="", metavar="TEXT", help="cases whose name holds this text")
+    parser.add_argument("--weights", type=Path, default=default_weights(), help="of the network that is asked")
     arguments = parser.parse_args()
     if arguments.case:
-        print(json.dumps(measure(arguments.case)))
+        print(json.dumps(measure(arguments.case, arguments.weights)))
         return
 
     predictor = GraspPredictor.load(default_weights(), num_threads=1)
@@ -204,7 +206,7 @@ def main() -> None:
     for name in (*queries(), *bodies()):
         if arguments.only not in name:
             continue
-        command = [sys.executable, "-m", "bench.worst", "--case", name]
+        command = [sys.executable, "-m", "bench.worst", "--case", name, "--weights", str(arguments.weights)]
         found = json.loads(subprocess.run(command, stdout=subprocess.PIPE, text=True, check=True).stdout)
         seconds = found["seconds"]
         unseen = f"{1e3 * found['unseen']:10.0f}" if "unseen" in found else ""

@@ -37,9 +37,6 @@ MOST_SCORED = 10_000
 """Candidates in all further searches together, fewer where the hand may have fewer: who asks for many at once has had
 them."""
 
-_SCORED_AT_ONCE = 2_500
-"""Candidates, of which requests have 2,000 unless they ask for more."""
-
 _RANKINGS = 4
 """At most so often grasps are ranked, less those that turn out to hold posted points."""
 
@@ -292,7 +289,7 @@ class GraspPredictor:
         """(F,) of the free candidates, of which so many are scored together that the clock is looked at often."""
         a, b = self._calibration
         logits = []
-        for rows in torch.arange(len(found.free), device=self.device).split(_SCORED_AT_ONCE):
+        for rows in torch.arange(len(found.free), device=self.device).split(self._network.scored_at_once):
             clock.check()
             logits.append(self._network.score(features, prepared, found.free.select(rows)))
         scores = torch.sigmoid(a * torch.cat(logits) + b)

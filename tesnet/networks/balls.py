@@ -63,6 +63,7 @@ class BallNetwork(nn.Module):
     """
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
+    scored_at_once: ClassVar[int] = 200
 
     def __init__(self, config: BallConfig, features: int) -> None:
         super().__init__()

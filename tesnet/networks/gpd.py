@@ -50,6 +50,7 @@ class GPD(nn.Module):
     """Scores each candidate by the images of its own region; nothing is shared between candidates."""
 
     preparation: ClassVar[PreparationConfig] = FINE
+    scored_at_once: ClassVar[int] = 200
 
     def __init__(self, config: GPDConfig) -> None:
         super().__init__()

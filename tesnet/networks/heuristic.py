@@ -45,6 +45,7 @@ class Heuristic(nn.Module):
     """Scores candidates by geometry alone."""
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
+    scored_at_once: ClassVar[int] = 2_500
 
     def __init__(self, config: HeuristicConfig) -> None:
         super().__init__()

@@ -28,6 +28,8 @@ class Network(Protocol):
     config: Any
     preparation: ClassVar[PreparationConfig]
     """How clouds are prepared when the network is trained afresh; of trained weights the header has the last word."""
+    scored_at_once: ClassVar[int]
+    """So many candidates take a core some tens of milliseconds; between as many it is asked whether anybody waits."""
 
     def __init__(self, config: Any) -> None: ...
 

@@ -57,6 +57,7 @@ class PointNetGPD(nn.Module):
     """Scores each candidate by the N points of its own region; nothing is shared between candidates."""
 
     preparation: ClassVar[PreparationConfig] = FINE
+    scored_at_once: ClassVar[int] = 200
 
     def __init__(self, config: PointNetGPDConfig) -> None:
         super().__init__()

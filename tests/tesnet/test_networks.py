@@ -34,6 +34,7 @@ class Counting(torch.nn.Module):
     """The least that is a network: its feature of a cloud is the number of its points, and all candidates score it."""
 
     preparation: ClassVar[cloud.PreparationConfig] = cloud.PreparationConfig(voxel_size=0.006)
+    scored_at_once: ClassVar[int] = 100
 
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()
