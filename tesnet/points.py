@@ -18,6 +18,9 @@ _MARGIN = 0.015
 
 _SLAB_QUERIES, _STRIP_QUERIES = 384, 64
 
+_NEARLY_FARTHEST = 0.7
+"""Of the distance of the farthest point from those chosen: from here on a point is chosen in the same round."""
+
 _LARGEST_TABLE = 4_000_000
 """Distances that are in memory at a time, at most."""
 
@@ -125,6 +128,38 @@ def _self_first(neighbours: Tensor) -> Tensor:
     neighbours = neighbours.gather(1, order)
     neighbours[:, 0] = own
     return neighbours
+
+
+def farthest_points(points: Tensor, count: int, start: int) -> Tensor:
+    """Indices (min(count, P),) of points (P, 3) spread evenly, by farthest-point sampling with several points a round.
+
+    In a round every chosen point's Voronoi cell offers its point farthest from it, and those are taken that are at
+    least `_NEARLY_FARTHEST` times as far as the farthest of all; where fewer are wanted, the farthest ones. Plain
+    farthest-point sampling (Gonzalez 1985) takes one point a round; here fewer rounds leave no point farther than 1.7
+    times as far from the chosen ones (measured for 128 of them).
+    """
+    chosen = torch.tensor([start], device=points.device)
+    distance = (points - points[start]).norm(dim=1)
+    cell = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    count = min(count, len(points))
+    while len(chosen) < count:
+        reach = torch.zeros(len(chosen), device=points.device).scatter_reduce(0, cell, distance, "amax")
+        is_farthest = (distance == reach[cell]) & (distance > 0)
+        index = torch.where(is_farthest, torch.arange(len(points), device=points.device), len(points))
+        first = torch.full((len(chosen),), len(points), device=points.device).scatter_reduce(0, cell, index, "amin")
+        new = first[(first < len(points))]
+        if len(new) == 0:  # the remaining points coincide with chosen ones
+            break
+        new = new[distance[new] >= _NEARLY_FARTHEST * distance.max()]
+        new = new[distance[new].argsort(descending=True, stable=True)[: count - len(chosen)]]
+        to_new = torch.cdist(points, points[new])
+        nearest = to_new.min(dim=1)
+        closer = nearest.values < distance
+        cell = torch.where(closer, nearest.indices + len(chosen), cell)
+        distance = torch.where(closer, nearest.values, distance)
+        distance[new] = 0
+        chosen = torch.cat([chosen, new])
+    return chosen
 
 
 def statistical_outliers(points: Tensor, neighbours: Tensor, std_ratio: float) -> Tensor:

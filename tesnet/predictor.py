@@ -13,19 +13,15 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from tesnet import calibration, candidates, cloud, collision, networks, plausibility, ranking, support, weights
+from tesnet import calibration, candidates, cloud, collision, networks, notices, ranking, support, weights
 from tesnet.errors import DeviceError, GaveUp, WeightsError
-from tesnet.geometry import PANDA, Box, GraspSet, Pose
+from tesnet.geometry import GraspSet, Pose
 from tesnet.networks import Network
 from tesnet.outline import Outline, outline
-from tesnet.points import nearest_neighbours
-from tesnet.query import MAX_CANDIDATES, MAX_SEED, NO_VIEWPOINT, GraspQuery
+from tesnet.query import MAX_CANDIDATES, MAX_SEED, GraspQuery
 from tesnet.result import REJECTIONS, GraspCounts, GraspResult, Reason
 from tesnet.search import search
 from tesnet.threads import Threads
-
-COARSEST_RESOLUTION = 0.0005
-"""Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
 
 GOOD_SCORE = 0.9
 """While the best score is lower, other candidates are searched for."""
@@ -195,20 +191,20 @@ class GraspPredictor:
         rejected = dict.fromkeys(REJECTIONS, 0)
         query, corrected = calibration.calibrated(query)
         query, plane, said = support.settled(query)
-        notes = [*_query_warnings(query), *corrected, *said, *_support_warnings(query)]
+        notes = [*notices.of_query(query), *corrected, *said, *notices.of_support(query)]
 
         clock.check()
         prepared = cloud.prepare(query, self._preparation, self.device, plane, clock.check)
         self._synchronise()
         clock.lap("prepare")
         if prepared is not None:
-            notes += _cloud_warnings(prepared, query, self._preparation)
+            notes += notices.of_cloud(prepared, query, self._preparation)
         if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
             count = 0 if prepared is None else len(prepared)
             outside = prepared is None and len(query.points) > 0 and (plane is None or query.workspace is not None)
             reason: Reason = "no_points_in_workspace" if outside else "too_few_points"
             return _nothing(query, reason, (count, 0, 0), rejected, notes, clock)
-        notes += _target_warnings(prepared, query, self._preparation)
+        notes += notices.of_target(prepared, query, self._preparation)
 
         edges = cache(partial(outline, prepared, query))
         found = self._search(prepared, query, edges, clock)
@@ -217,7 +213,7 @@ class GraspPredictor:
         if len(found.free) == 0:
             reason = "all_in_collision" if found.count else "no_candidates"
             sizes = (len(prepared), found.count, 0)
-            notes += _answer_warnings(0.0, prepared, query)
+            notes += notices.of_answer(0.0, prepared, query)
             return _nothing(query, reason, sizes, rejected | found.rejected, notes, clock)
         return _Proposal(query, prepared, edges, found, notes, clock)
 
@@ -254,11 +250,12 @@ class GraspPredictor:
         rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
         grasps = _grasps(query, prepared, found.free, scores, ranked.indices)
         clock.lap("rank")
+        best = float(scores.max()) if len(scores) else 0.0
         return GraspResult(
             grasps=grasps,
             counts=_counts(query, (len(prepared), found.count, len(found.free), len(grasps)), rejected),
             reason=_why_nothing(found) if len(grasps) == 0 else None,
-            warnings=(*proposal.notes, *_answer_warnings(float(scores.max()) if len(scores) else 0.0, prepared, query)),
+            warnings=(*proposal.notes, *notices.of_answer(best, prepared, query)),
             timings_ms=clock.laps_ms,
         )
 
@@ -440,75 +437,6 @@ def _device(name: str) -> torch.device:
     if device.type == "cuda" and (device.index or 0) >= torch.cuda.device_count():
         raise DeviceError(f"device {name!r}: torch sees {torch.cuda.device_count()} GPUs here; choose cpu or auto")
     return device
-
-
-def _query_warnings(query: GraspQuery) -> list[str]:
-    notes = list(query.notes)
-    if query.viewpoints is None:
-        notes.append(NO_VIEWPOINT)
-    if query.up is None:
-        notes.append("up not given: grasps from below are not filtered, only those that come from behind what is seen")
-    if query.gripper != PANDA:
-        notes.append("gripper is not the hand that the network was trained with: only collision and width follow it")
-    return notes
-
-
-def _target_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
-    if prepared.on_target is None or bool(prepared.on_target.any()):
-        return []
-    if query.target is None or isinstance(query.target, Box):
-        return ["target holds none of the points that are left after the crop: nothing can be grasped there"]
-    note = (
-        f"target has {int(query.target.sum())} points, but no {config.voxel_size * 1000:g} mm cell that is left after "
-        "the crop has as many of them as of others: mark all points of the object, or give a box"
-    )
-    return [note]
-
-
-def _support_warnings(query: GraspQuery) -> list[str]:
-    up = query.known_up
-    if up is None or query.viewpoints is None or not isinstance(query.support_height, float):
-        return []
-    note = plausibility.reversed_up(query.viewpoints @ up, query.support_height)
-    return [] if note is None else [note]
-
-
-def _answer_warnings(best: float, prepared: cloud.PreparedCloud, query: GraspQuery) -> list[str]:
-    return plausibility.answer_notes(best, prepared.points.cpu().numpy(), query.gripper.max_width)
-
-
-def _point_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
-    points = prepared.points
-    # A network that uses no graph asks for no neighbours but the point itself.
-    neighbours = prepared.neighbours if config.graph_neighbours > 1 else nearest_neighbours(points, 2)
-    spacing = float((points - points[neighbours[:, 1]]).norm(dim=1).median())
-    notes = plausibility.cloud_notes(points.cpu().numpy(), spacing, config.voxel_size)
-    if query.viewpoints is not None:
-        enclosed = (plausibility.enclosed_viewpoint(query.points, viewpoint) for viewpoint in query.viewpoints)
-        notes += [note for note in enclosed if note is not None]
-    return notes
-
-
-def _cloud_warnings(prepared: cloud.PreparedCloud, query: GraspQuery, config: cloud.PreparationConfig) -> list[str]:
-    notes = _point_warnings(prepared, query, config) if len(prepared) >= cloud.MINIMUM_POINTS else []
-    distance = float(np.abs(prepared.T_cloud_canonical.translation).max())
-    resolution = float(np.spacing(np.float32(distance)))
-    if resolution > COARSEST_RESOLUTION:
-        notes.append(
-            f"the cloud lies {distance:.0f} m from the origin of its frame, where coordinates are kept to "
-            f"{resolution * 1000:.2g} mm only: use a frame near the cloud"
-        )
-    if prepared.dropped_far:
-        notes.append(
-            f"{prepared.dropped_far} points farther than {config.max_extent:g} m from the cloud's median were ignored"
-        )
-    if prepared.dropped_surplus:
-        notes.append(
-            f"the cloud is large: in {prepared.dropped_surplus} of its {config.voxel_size * 1000:g} mm cells, the "
-            f"farthest from its middle or, on a support that was found, from the camera, no grasps were looked for; "
-            f"set workspace or target to choose what matters"
-        )
-    return notes
 
 
 def _nothing(

@@ -13,9 +13,10 @@ ELSEWHERE = {
     "client/__main__.py": "tests/client/test_command.py",
     "simharness/__main__.py": "tests/simharness/test_cli.py",
     "training/__main__.py": "tests/training/test_command.py",
+    "tesnet/notices.py": "tests/tesnet/test_predictor.py",
     "tesnet/result.py": "tests/tesnet/test_predictor.py",
 }
-"""What `python -m` starts is tested as its user meets it, and an answer by what fills it."""
+"""What `python -m` starts is tested as its user meets it, and an answer and its warnings by what fills it."""
 
 
 @pytest.mark.parametrize("package", ["client", "service", "simharness", "tesnet", "training"])

@@ -17,6 +17,7 @@ from tesnet.clearance import LEAST_REACH, NEAREST, WANTED_REACH
 from tesnet.geometry import PANDA, Gripper, Pose
 from tesnet.hands import HANDS
 from tesnet.outline import Outline, outline
+from tesnet.points import farthest_points
 from tesnet.query import ApproachCone
 from tests.tesnet.hand_twin import HANDS_TO_TRY, depth_in_hand
 from tests.tesnet.raycast import Bowl, Slab, overhead_query
@@ -72,7 +73,7 @@ def coverage(points: Array, chosen: list[int]) -> float:
 @settings(max_examples=12, deadline=None)
 def test_farthest_points_cover_nearly_as_well_as_one_by_one(seed: int, count: int, start: int) -> None:
     points = ready(seed).points
-    chosen = candidates.farthest_points(points, count, start).tolist()
+    chosen = farthest_points(points, count, start).tolist()
     assert chosen[0] == start
     assert len(set(chosen)) == count
     reference = farthest_points_one_by_one(exact(points), count, start)
@@ -82,13 +83,13 @@ def test_farthest_points_cover_nearly_as_well_as_one_by_one(seed: int, count: in
 
 def test_no_more_points_are_chosen_than_are_different() -> None:
     points = torch.tensor([[0.0, 0, 0], [1, 0, 0], [0, 0, 0], [1, 0, 0], [0, 2, 0]])
-    assert sorted(map(tuple, points[candidates.farthest_points(points, 5, 2)].tolist())) == [
+    assert sorted(map(tuple, points[farthest_points(points, 5, 2)].tolist())) == [
         (0.0, 0.0, 0.0),
         (0.0, 2.0, 0.0),
         (1.0, 0.0, 0.0),
     ]
-    assert candidates.farthest_points(points[:1], 8, 0).tolist() == [0]
-    assert candidates.farthest_points(points, 1, 4).tolist() == [4]
+    assert farthest_points(points[:1], 8, 0).tolist() == [0]
+    assert farthest_points(points, 1, 4).tolist() == [4]
 
 
 # Pairs and poses
@@ -96,7 +97,7 @@ def test_no_more_points_are_chosen_than_are_different() -> None:
 
 def test_pairs_are_those_of_a_double_loop_over_the_limits() -> None:
     points, normals = exact(ready().points), exact(ready().normals)
-    approach = candidates.farthest_points(ready().points, 12, 5)
+    approach = farthest_points(ready().points, 12, 5)
     pairs = candidates.pairs_in_reach(ready().points, ready().normals, approach, CONFIG)
     found = set(zip(*(index.tolist() for index in pairs), strict=True))
     certain, possible = set(), set()

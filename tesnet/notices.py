@@ -1,0 +1,91 @@
+"""The warnings of an answer, in words: of the query, of its cloud, its target, its support and the scores.
+
+What the numbers themselves suggest of a mistake is judged in `tesnet.plausibility`.
+"""
+
+from __future__ import annotations
+
+import numpy as np
+
+from tesnet import plausibility
+from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, PreparedCloud
+from tesnet.geometry import PANDA, Box
+from tesnet.points import nearest_neighbours
+from tesnet.query import NO_VIEWPOINT, GraspQuery
+
+COARSEST_RESOLUTION = 0.0005
+"""Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
+
+
+def of_query(query: GraspQuery) -> list[str]:
+    """What the query itself leaves open."""
+    notes = list(query.notes)
+    if query.viewpoints is None:
+        notes.append(NO_VIEWPOINT)
+    if query.up is None:
+        notes.append("up not given: grasps from below are not filtered, only those that come from behind what is seen")
+    if query.gripper != PANDA:
+        notes.append("gripper is not the hand that the network was trained with: only collision and width follow it")
+    return notes
+
+
+def of_target(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
+    """Why a target holds nothing that is left."""
+    if prepared.on_target is None or bool(prepared.on_target.any()):
+        return []
+    if query.target is None or isinstance(query.target, Box):
+        return ["target holds none of the points that are left after the crop: nothing can be grasped there"]
+    note = (
+        f"target has {int(query.target.sum())} points, but no {config.voxel_size * 1000:g} mm cell that is left after "
+        "the crop has as many of them as of others: mark all points of the object, or give a box"
+    )
+    return [note]
+
+
+def of_support(query: GraspQuery) -> list[str]:
+    """Whether up points away from the camera's side of the plane."""
+    up = query.known_up
+    if up is None or query.viewpoints is None or not isinstance(query.support_height, float):
+        return []
+    note = plausibility.reversed_up(query.viewpoints @ up, query.support_height)
+    return [] if note is None else [note]
+
+
+def of_answer(best: float, prepared: PreparedCloud, query: GraspQuery) -> list[str]:
+    """Whether the scores are so low that the scale may be wrong."""
+    return plausibility.answer_notes(best, prepared.points.cpu().numpy(), query.gripper.max_width)
+
+
+def _of_points(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
+    points = prepared.points
+    # A network that uses no graph asks for no neighbours but the point itself.
+    neighbours = prepared.neighbours if config.graph_neighbours > 1 else nearest_neighbours(points, 2)
+    spacing = float((points - points[neighbours[:, 1]]).norm(dim=1).median())
+    notes = plausibility.cloud_notes(points.cpu().numpy(), spacing, config.voxel_size)
+    if query.viewpoints is not None:
+        enclosed = (plausibility.enclosed_viewpoint(query.points, viewpoint) for viewpoint in query.viewpoints)
+        notes += [note for note in enclosed if note is not None]
+    return notes
+
+
+def of_cloud(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
+    """What the prepared cloud suggests of a mistake, and what was left out of it."""
+    notes = _of_points(prepared, query, config) if len(prepared) >= MINIMUM_POINTS else []
+    distance = float(np.abs(prepared.T_cloud_canonical.translation).max())
+    resolution = float(np.spacing(np.float32(distance)))
+    if resolution > COARSEST_RESOLUTION:
+        notes.append(
+            f"the cloud lies {distance:.0f} m from the origin of its frame, where coordinates are kept to "
+            f"{resolution * 1000:.2g} mm only: use a frame near the cloud"
+        )
+    if prepared.dropped_far:
+        notes.append(
+            f"{prepared.dropped_far} points farther than {config.max_extent:g} m from the cloud's median were ignored"
+        )
+    if prepared.dropped_surplus:
+        notes.append(
+            f"the cloud is large: in {prepared.dropped_surplus} of its {config.voxel_size * 1000:g} mm cells, the "
+            f"farthest from its middle or, on a support that was found, from the camera, no grasps were looked for; "
+            f"set workspace or target to choose what matters"
+        )
+    return notes
