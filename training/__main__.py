@@ -22,6 +22,7 @@ from training.evaluate import evaluate
 from training.fit import PRESETS as RECIPES
 from training.fit import fit
 from training.generate import GenerateConfig, generate
+from training.viewing import MoreViews
 from training.views import LabelsError
 
 
@@ -103,10 +104,7 @@ def _add_generate(parser: argparse.ArgumentParser) -> None:
         choices=networks.NETWORKS,
         help="prepare the clouds as this network wants them (with --mine: as that one does)",
     )
-    parser.add_argument(
-        "--camera", choices=(*PRESETS, "any"), default="random", help="'any': one to four views from anywhere"
-    )
-    parser.add_argument("--sensor", choices=(*SENSORS, "random"), help="default: the camera's own")
+    _add_camera(parser, "of the labels")
     parser.add_argument(
         "--gripper",
         choices=(*HANDS, "random"),
@@ -174,6 +172,16 @@ def _add_unpack(parser: argparse.ArgumentParser) -> None:
     parser.set_defaults(run=_unpack)
 
 
+def _add_camera(parser: argparse.ArgumentParser, whose: str) -> None:
+    parser.add_argument(
+        "--camera",
+        choices=(*PRESETS, "any"),
+        default="random",
+        help=f"{whose}; 'any': one to four views from anywhere",
+    )
+    parser.add_argument("--sensor", choices=(*SENSORS, "random"), help=f"{whose}; default: the camera's own")
+
+
 def _add_more_views(parser: argparse.ArgumentParser) -> None:
     parser.add_argument(
         "--more-views",
@@ -182,6 +190,11 @@ def _add_more_views(parser: argparse.ArgumentParser) -> None:
         metavar="N",
         help="of archives, show each scene's labels from N new cameras, too",
     )
+    _add_camera(parser, "of --more-views")
+
+
+def _more_views(options: argparse.Namespace) -> MoreViews:
+    return MoreViews(options.more_views, options.camera, options.sensor)
 
 
 def _unpack(options: argparse.Namespace) -> dict[str, object]:
@@ -190,7 +203,7 @@ def _unpack(options: argparse.Namespace) -> dict[str, object]:
         options.objects,
         options.out,
         options.workers,
-        options.more_views,
+        _more_views(options),
         scenes=options.scenes,
         seed=options.seed,
         preparation=_preparation_of(options.model),
@@ -251,7 +264,7 @@ def _rendered(archive: Path, options: argparse.Namespace) -> Path:
         raise LabelsError(f"{archive} is an archive, whose clouds are rendered again; name its objects with --objects")
     folder: Path = options.out.parent / f"{archive.name}-rendered"
     preparation = _preparation_of(options.model)
-    unpack(archive, options.objects, folder, options.threads, options.more_views, preparation=preparation)
+    unpack(archive, options.objects, folder, options.threads, _more_views(options), preparation=preparation)
     return folder
 
 

@@ -13,6 +13,7 @@ from contextlib import contextmanager
 from dataclasses import dataclass, replace
 from pathlib import Path
 from typing import Any
+from zlib import crc32
 
 import numpy as np
 import torch
@@ -28,7 +29,7 @@ from tesnet import cloud
 from tesnet.collision import blocked
 from tesnet.points import nearest_neighbours
 from training.parts import ArchivedScene, ArchivedView, keys_of, read_part, viewing_of_cameras, write_part
-from training.viewing import Viewing, draw_viewing, viewings_of
+from training.viewing import MoreViews, Viewing, viewings_of
 from training.views import (
     LabelledView,
     LabelsError,
@@ -44,6 +45,7 @@ LARGEST_SHIFT = 0.015
 within so many metres."""
 
 _TODAY = cloud.PreparationConfig()
+_NO_MORE = MoreViews()
 SCENES_PER_PART = 1000
 _HEAR_S = 1.0
 
@@ -87,7 +89,7 @@ def unpack(
     objects: str,
     out: Path,
     workers: int = 1,
-    more_views: int = 0,
+    more_views: MoreViews = _NO_MORE,
     *,
     scenes: int | None = None,
     seed: int = 0,
@@ -201,7 +203,7 @@ class _Renderer:
     """What a worker needs to render any scene."""
 
     objects: str
-    more_views: int
+    more_views: MoreViews
     preparation: cloud.PreparationConfig
 
     def name(self, job: _Rendering) -> str:
@@ -229,16 +231,18 @@ def _models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
 
 
 def _render_scene(
-    job: _Rendering, models: Mapping[str, ObjectModel], more_views: int, preparation: cloud.PreparationConfig
+    job: _Rendering, models: Mapping[str, ObjectModel], more_views: MoreViews, preparation: cloud.PreparationConfig
 ) -> None:
     views = job.scene.views
-    rng = np.random.default_rng([len(views), *(len(view.outcomes) for view in views)])
+    rng = np.random.default_rng(
+        [crc32(view.outcomes.tobytes()) for view in views]
+    )  # of their number many scenes have the same
     with World() as world:
         restore_scene(world, job.scene.description, models)
         shown = [(view.viewing, _render_view(world, view, preparation)) for view in views]
-        for _ in range(more_views if views else 0):
-            viewing = draw_viewing("random", None, rng)
-            shown.append((viewing, _from_elsewhere(world, views, viewing, preparation)))
+        if views:
+            others = more_views.draw(rng)
+            shown += [(viewing, _from_elsewhere(world, views, viewing, preparation)) for viewing in others]
     kept = [(viewing, view) for viewing, view in shown if view is not None]
     description = {**job.scene.description, "views": [viewing.describe() for viewing, _ in kept]}
     save_scene(job.path, description, [replace(view, scene=description["kind"]) for _, view in kept], preparation)

@@ -81,6 +81,25 @@ class Viewing:
         return calibrated(query)[0]
 
 
+@dataclass(frozen=True, slots=True)
+class MoreViews:
+    """New looks at a scene whose labels are there.
+
+    Args:
+        count: so many.
+        camera: a preset, or `any`.
+        sensor: as `draw_viewing` takes it.
+    """
+
+    count: int = 0
+    camera: Camera = "random"
+    sensor: str | None = None
+
+    def draw(self, rng: np.random.Generator) -> list[Viewing]:
+        """Ways to look at one scene."""
+        return [draw_viewing(self.camera, self.sensor, rng) for _ in range(self.count)]
+
+
 def draw_viewing(camera: Camera, sensor: str | None, rng: np.random.Generator) -> Viewing:
     """A way to look at a scene.
 

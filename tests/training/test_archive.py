@@ -19,6 +19,7 @@ from training import archive, viewing
 from training.__main__ import main
 from training.archive import _draw, pack, unpack
 from training.generate import GenerateConfig, generate
+from training.viewing import MoreViews
 from training.views import LabelledView, LabelsError, load_scene, scene_files
 
 pytestmark = pytest.mark.sim
@@ -56,9 +57,24 @@ def test_an_archive_renders_the_views_and_labels_that_went_in(labels: Path, tmp_
     assert kept == account["labels"]
 
 
+def test_more_views_may_be_of_any_camera_and_sensor(labels: Path, tmp_path: Path) -> None:
+    pack([labels], tmp_path / "archive")
+    more = MoreViews(2, "any", "random")
+    unpack(tmp_path / "archive", "procedural-train", tmp_path / "again", more_views=more)
+    added = []
+    for before, after in zip(scene_files([labels]), scene_files([tmp_path / "again"]), strict=True):
+        old, (description, views) = load_scene(before)[1], load_scene(after)
+        assert [view.sensor for view in views] == [viewing["sensor"] for viewing in description["views"]]
+        added += description["views"][len(old) :]
+    assert len(added) > 1
+    assert {viewing["sensor"] for viewing in added} == {"random"}
+    assert len({viewing["seed"] for viewing in added}) == len(added)
+    assert any(viewing["shows"] != "box" or len(viewing["cameras"]) > 1 for viewing in added)
+
+
 def test_more_views_show_the_labels_of_their_scene_from_new_cameras(labels: Path, tmp_path: Path) -> None:
     pack([labels], tmp_path / "archive")
-    unpack(tmp_path / "archive", "procedural-train", tmp_path / "again", more_views=3)
+    unpack(tmp_path / "archive", "procedural-train", tmp_path / "again", more_views=MoreViews(3))
     shown = 0
     for before, after in zip(scene_files([labels]), scene_files([tmp_path / "again"]), strict=True):
         old, (description, views) = load_scene(before)[1], load_scene(after)
@@ -124,7 +140,7 @@ def test_scenes_are_rendered_with_clouds_as_the_service_prepares_them(
     preparation = GraspPredictor.load(weights.default_weights()).preparation
     scene = archive._read_scene(next(path for path in scene_files([labels]) if load_scene(path)[1]))
     job = archive._Rendering(replace(scene, views=scene.views[:1]), tmp_path / "scene_0.npz")
-    archive._render_scene(job, archive._models_by_kind("procedural-train")["packed"], 0, preparation)
+    archive._render_scene(job, archive._models_by_kind("procedural-train")["packed"], MoreViews(), preparation)
     (view,) = load_scene(tmp_path / "scene_0.npz")[1]
     served = prepare(queries[0], preparation, torch.device("cpu"))
     assert served is not None
