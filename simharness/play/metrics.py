@@ -87,6 +87,7 @@ class Summary:
         rounds: finished rounds.
         gsr, dr: grasp success rate and declutter rate.
         failures: failed attempts by kind, every kind named.
+        corrected: attempts on depth that the service corrected (`--calibrate`).
         no_grasps: observations without a grasp, by the service's reason.
         ended: rounds by the way they ended, every way named.
         service_ms, round_trip_ms: times of the requests.
@@ -96,6 +97,7 @@ class Summary:
     gsr: Rate
     dr: Rate
     failures: dict[str, int]
+    corrected: int
     no_grasps: dict[str, int]
     ended: dict[str, int]
     service_ms: Percentiles
@@ -117,6 +119,7 @@ def summarise(rounds: Iterable[RoundRecord]) -> Summary:
         gsr=Rate(successes, len(attempts)),
         dr=Rate(successes, sum(len(record.objects) for record in done)),
         failures={kind: failures[kind] for kind in FAILURE_KINDS},
+        corrected=sum(attempt.corrected for attempt in attempts),
         no_grasps=dict(sorted(Counter(entry.reason for entry in no_grasps).items())),
         ended={way: ended[way] for way in ROUND_ENDS},
         service_ms=Percentiles.of([latency.service for latency in latencies if latency.service is not None]),

@@ -23,6 +23,9 @@ OBJECTS_PER_ROUND = 5
 FAILURES_IN_A_ROW = 2
 NO_GRASPS_IN_A_ROW = 3
 
+_CALIBRATED, _CORRECTED = "calibrate", "depth is multiplied by"
+"""How the service's warning of a correction begins, and what it says and others do not."""
+
 TIMING_KEYS = ("latency_ms",)
 """Keys of the JSON forms that hold measured times; everything else repeats bit for bit."""
 
@@ -76,6 +79,7 @@ class AttemptRecord:
         contact_at_start, contact_on_way: whether the hand touched anything before closing.
         counts: the response's counts.
         latency: the request's times; None when the planner had no need of one.
+        warnings: the response's.
     """
 
     seed: int
@@ -94,6 +98,7 @@ class AttemptRecord:
     contact_on_way: bool
     counts: Mapping[str, Any]
     latency: Latency | None
+    warnings: tuple[str, ...] = ()
 
     def __post_init__(self) -> None:
         pose = np.array(self.T_world_grasp, dtype=np.float64)
@@ -101,6 +106,11 @@ class AttemptRecord:
             raise ValueError(f"T_world_grasp has shape {pose.shape}; expected (4, 4)")
         pose.setflags(write=False)
         object.__setattr__(self, "T_world_grasp", pose)
+
+    @property
+    def corrected(self) -> bool:
+        """Whether the service corrected the depth that it was sent."""
+        return any(warning.startswith(_CALIBRATED) and _CORRECTED in warning for warning in self.warnings)
 
     @property
     def success(self) -> bool:
@@ -126,6 +136,7 @@ class AttemptRecord:
             "viewpoints": [list(viewpoint) for viewpoint in self.viewpoints],
             "request_seed": self.request_seed,
             "counts": dict(self.counts),
+            "warnings": list(self.warnings),
             "latency_ms": _latency_to_json(self.latency),
         }
 
@@ -153,6 +164,7 @@ class AttemptRecord:
             contact_on_way=values["contact_on_way"],
             counts=values["counts"],
             latency=_latency_from_json(values["latency_ms"]),
+            warnings=tuple(values.get("warnings", ())),  # runs of before 0.5.0 have none
         )
 
 

@@ -29,7 +29,7 @@ class RecordedPlanner:
         attempt = self._grasps.get(self._observation)
         if attempt is None:
             return Plan.nothing(self._reasons[self._observation])
-        response: dict[str, Any] = {"counts": attempt.counts}
+        response: dict[str, Any] = {"counts": attempt.counts, "warnings": attempt.warnings}
         return Plan(attempt.T_world_grasp[None], np.array([attempt.score]), np.array([attempt.width]), None, response)
 
 

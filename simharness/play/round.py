@@ -47,7 +47,7 @@ class Plan:
         scores: (M,) probabilities of success.
         widths: (M,) openings to set, metres.
         latency_ms: how long the planner took; None when it did not have to think.
-        response: what it said beside the grasps (`reason`, `counts`, `timings_ms` are read), or None.
+        response: what it said beside the grasps (`reason`, `counts`, `warnings`, `timings_ms` are read), or None.
     """
 
     Ts_world_grasp: Float64[np.ndarray, "grasps 4 4"]
@@ -81,6 +81,11 @@ class Plan:
         """The response's account of points and candidates."""
         counts: Mapping[str, Any] = (self.response or {}).get("counts", {})
         return counts
+
+    @property
+    def warnings(self) -> tuple[str, ...]:
+        """The response's."""
+        return tuple((self.response or {}).get("warnings", ()))
 
     @property
     def latency(self) -> Latency | None:
@@ -293,6 +298,7 @@ class _Table:
             contact_on_way=outcome.contact_on_way,
             counts=plan.counts,
             latency=plan.latency,
+            warnings=plan.warnings,
         )
         self.attempts.append(record)
         self._tell(Attempted(record, observed, outcome))

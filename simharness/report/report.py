@@ -74,6 +74,8 @@ def table(run: Run) -> str:
         f"no grasp  {counts(total.no_grasps)}",
         f"latency   service {times(total.service_ms)}, round trip {times(total.round_trip_ms)}",
     ]
+    if run.settings.calibrate:
+        lines.append(f"depth     corrected in {total.corrected} of {total.gsr.total} attempts")
     if run.stopped_by is not None:
         lines.append(f"INCOMPLETE: {run.stopped_by.splitlines()[0]}")
     return "\n".join(lines)
@@ -138,6 +140,7 @@ def numbers(summary: Summary) -> dict[str, Any]:
         "objects_grasped": summary.dr.count,
         "objects_total": summary.dr.total,
         "failures": summary.failures,
+        "corrected": summary.corrected,
         "no_grasps": summary.no_grasps,
         "rounds": summary.rounds,
         "rounds_ended": summary.ended,

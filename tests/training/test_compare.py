@@ -88,7 +88,7 @@ def test_curves_are_means_over_the_epochs_that_all_runs_of_a_network_have(folder
     runs = read_runs(folder / "runs")
     runs[0] = replace(runs[0], epochs=runs[0].epochs[:1])
     loss, accuracy = panels(runs)
-    assert {name: len(values) for name, values in loss.series.items()} == {"edgegrasp": 1, "tesnet": 2}
+    assert {name: len(values) for name, values in loss.series.items()} == {"edgegrasp": 1, "tesnet (same data)": 2}
     first = [log_of(folder, f"edgegrasp-{seed}")[0]["with_blocked"] for seed in (0, 1)]
     assert loss.series["edgegrasp"][0] == pytest.approx(sum(entry["balanced_loss"] for entry in first) / 2)
     assert accuracy.series["edgegrasp"][0] == pytest.approx(50 * sum(entry["accuracy"] for entry in first))

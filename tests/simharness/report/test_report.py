@@ -1,10 +1,17 @@
 from __future__ import annotations
 
 import json
+from dataclasses import replace
 from typing import Any
+
+import numpy as np
+import pytest
 
 from simharness.play.records import Run
 from simharness.report.report import package_versions, report, table
+from tesnet.calibration import calibrated
+from tesnet.query import GraspQuery
+from tests.tesnet.scenes import CAMERA, UP
 
 
 def test_the_report_has_rates_counts_settings_and_model(run: Run) -> None:
@@ -30,6 +37,23 @@ def test_the_report_has_rates_counts_settings_and_model(run: Run) -> None:
         1,
         "cpu",
     )
+
+
+@pytest.mark.parametrize("scale", [1.03, 1.0])
+def test_what_the_service_says_it_corrected_is_counted(run: Run, scale: float) -> None:
+    rng = np.random.default_rng(0)
+    table_points = np.column_stack([rng.uniform(-0.25, 0.25, (20_000, 2)), rng.normal(0, 1e-4, 20_000)])
+    seen = CAMERA + scale * (table_points - CAMERA)
+    query = GraspQuery(seen, viewpoints=CAMERA, up=UP, support_height=0.0 if scale > 1 else 5.0, calibrate=True)
+    said = tuple(calibrated(query)[1])
+    assert said
+    first = run.rounds[0]
+    told = [replace(attempt, warnings=("up not given", *said)) for attempt in first.attempts[:2]]
+    records = (replace(first, attempts=(*told, *first.attempts[2:])), *run.rounds[1:])
+    asked = replace(run, rounds=records, settings=replace(run.settings, calibrate=True))
+    assert report(asked, {})["corrected"] == (2 if scale > 1 else 0)
+    assert f"corrected in {2 if scale > 1 else 0} of 10 attempts" in table(asked)
+    assert "corrected" not in table(run)
 
 
 def test_seeds_are_pooled_and_told_apart(run: Run) -> None:
