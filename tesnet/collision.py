@@ -88,18 +88,35 @@ def palm_blocked(
         rise: limit of their moves along the travel, either way.
         between: called between blocks of work of some milliseconds.
     """
-    met = torch.zeros(len(candidates), dtype=torch.bool, device=points.device)
+
+    def meets(some: Tensor, rows: Tensor) -> Tensor:
+        x, y, z = points_in_grasp_frames(some, candidates.Ts_canonical_grasp[rows])
+        farthest = torch.maximum((y - least[rows, None]).abs(), (y - most[rows, None]).abs())
+        inside = [
+            inside_palm(x, farthest, place, candidates.gripper, APPROACH_DISTANCE)
+            for place in ((z,) if rise == 0.0 else (z - rise, z + rise))
+        ]
+        return torch.stack(inside).all(dim=0).any(dim=1)
+
+    return _with_few(points, len(candidates), meets, between)
+
+
+def _with_few(
+    points: Tensor, count: int, meets: Callable[[Tensor, Tensor], Tensor], between: Callable[[], None]
+) -> Tensor:
+    """Mask (C,) of the `count` hands that meet a point of the few that are tried.
+
+    Args:
+        points: (P, 3).
+        count: C.
+        meets: of some points and rows (R,) of hands, which of these meet one of those.
+        between: called between blocks of work of some milliseconds.
+    """
+    met = torch.zeros(count, dtype=torch.bool, device=points.device)
     for some in (points[::stride] for stride in _COARSE_STRIDES):
-        open_rows = (~met).nonzero()[:, 0]
-        for rows in open_rows.split(max(1, _BLOCK // max(1, len(some)))):
+        for rows in (~met).nonzero()[:, 0].split(max(1, _BLOCK // max(1, len(some)))):
             between()
-            x, y, z = points_in_grasp_frames(some, candidates.Ts_canonical_grasp[rows])
-            farthest = torch.maximum((y - least[rows, None]).abs(), (y - most[rows, None]).abs())
-            inside = [
-                inside_palm(x, farthest, place, candidates.gripper, APPROACH_DISTANCE)
-                for place in ((z,) if rise == 0.0 else (z - rise, z + rise))
-            ]
-            met[rows] = torch.stack(inside).all(dim=0).any(dim=1)
+            met[rows] = meets(some, rows)
     return met
 
 
@@ -162,25 +179,20 @@ def in_collision(
         approach_distance: length of the straight approach, which ends in the grasp.
         between: called between blocks of work of some milliseconds.
     """
-    hit = torch.zeros(len(Ts_canonical_grasp), dtype=torch.bool, device=points.device)
-    widths = torch.as_tensor(widths, dtype=points.dtype, device=points.device).expand(len(hit))
-    for some in (points[::stride] for stride in _COARSE_STRIDES):
-        open_rows = (~hit).nonzero()[:, 0]
-        for rows in open_rows.split(max(1, _BLOCK // max(1, len(some)))):
-            between()
-            hit[rows] = _hit(some, Ts_canonical_grasp[rows], gripper, widths[rows, None], approach_distance)
+    opened = torch.as_tensor(widths, dtype=points.dtype, device=points.device).expand(len(Ts_canonical_grasp))
+
+    def meets(some: Tensor, rows: Tensor) -> Tensor:
+        x, y, z = points_in_grasp_frames(some, Ts_canonical_grasp[rows])
+        return inside_hand(x, y, z, gripper, opened[rows, None], approach_distance).any(dim=1)
+
+    hit = _with_few(points, len(Ts_canonical_grasp), meets, between)
     left = (~hit).nonzero()[:, 0]
     obstacles = Obstacles.of(points)
     found = obstacles.count_in_hands(
-        Ts_canonical_grasp[left], gripper, widths[left], distance=approach_distance, between=between
+        Ts_canonical_grasp[left], gripper, opened[left], distance=approach_distance, between=between
     )
     hit[left] = found > 0
     return hit
-
-
-def _hit(points: Tensor, poses: Tensor, gripper: Gripper, width: Tensor, approach_distance: float) -> Tensor:
-    x, y, z = points_in_grasp_frames(points, poses)
-    return inside_hand(x, y, z, gripper, width, approach_distance).any(dim=1)
 
 
 def beyond(cloud: PreparedCloud) -> Tensor:

@@ -102,11 +102,8 @@ def reach_of_fitting(
     if not config.centred:
         return torch.zeros_like(near), torch.zeros_like(near), 0.0
     least = (near - (hand.max_width + _FARTHEST_UNSEEN) / 2).clamp(max=0.0)
-    rise = 0.0
-    if hand.linkage_length is not None:
-        at = hand.tcp_at(torch.linspace(0.0, hand.max_width, 32))
-        rise = 2 * float(at.max() - at.min())
-    return least, near.clamp(min=0.0), rise
+    tips = [hand.tcp_at(width) for width in hand.closing(hand.max_width)]
+    return least, near.clamp(min=0.0), 2 * float(max(tips) - min(tips))
 
 
 def _moved(

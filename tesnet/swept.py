@@ -5,6 +5,8 @@ Knows no cloud. Vectorised torch; lengths in metres.
 
 from __future__ import annotations
 
+from collections.abc import Sequence
+
 import torch
 from torch import Tensor
 
@@ -25,22 +27,13 @@ def inside_hand(
         distance: length of the straight way, ending in the grasp, on which a place counts as in the hand.
         depth: only places at least so deep under the surface of a part count, measured along the frame's axes.
     """
-    x, y = x.abs(), y.abs()
-    inside = torch.zeros_like(x, dtype=torch.bool)
-    for part in gripper.parts:
-        if part.side >= 0:  # seen by |y|, one finger is both
-            inside |= _inside_part(part, x, y, z, width, distance, depth)
-    return inside
+    # Seen by |y|, one finger is both.
+    return _inside_any([part for part in gripper.parts if part.side >= 0], x, y, z, width, distance, depth)
 
 
 def inside_palm(x: Tensor, y: Tensor, z: Tensor, gripper: Gripper, distance: float) -> Tensor:
     """Mask of the places that lie in what of the hand does not move as it closes, as `inside_hand` has it."""
-    x, y = x.abs(), y.abs()
-    inside = torch.zeros_like(x, dtype=torch.bool)
-    for part in gripper.parts:
-        if not part.side:
-            inside |= _inside_part(part, x, y, z, 0.0, distance, 0.0)
-    return inside
+    return _inside_any([part for part in gripper.parts if not part.side], x, y, z, 0.0, distance, 0.0)
 
 
 def boxes_of(
@@ -57,6 +50,16 @@ def boxes_of(
             outer = part.span(part.thickness.full, widest)[1]
             boxes.append(([0.0, inner, part.back - distance], [part.breadth.full / 2, outer, part.front]))
     return boxes
+
+
+def _inside_any(
+    parts: Sequence[Part], x: Tensor, y: Tensor, z: Tensor, width: Tensor | float, distance: float, depth: float
+) -> Tensor:
+    x, y = x.abs(), y.abs()
+    inside = torch.zeros_like(x, dtype=torch.bool)
+    for part in parts:
+        inside |= _inside_part(part, x, y, z, width, distance, depth)
+    return inside
 
 
 def _inside_part(

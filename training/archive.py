@@ -234,9 +234,8 @@ def _render_scene(
     job: _Rendering, models: Mapping[str, ObjectModel], more_views: MoreViews, preparation: cloud.PreparationConfig
 ) -> None:
     views = job.scene.views
-    rng = np.random.default_rng(
-        [crc32(view.outcomes.tobytes()) for view in views]
-    )  # of their number many scenes have the same
+    # Not of the number of outcomes, which many scenes share.
+    rng = np.random.default_rng([crc32(view.outcomes.tobytes()) for view in views])
     with World() as world:
         restore_scene(world, job.scene.description, models)
         shown = [(view.viewing, _render_view(world, view, preparation)) for view in views]
