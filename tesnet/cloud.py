@@ -20,6 +20,7 @@ from tesnet.orientation import orient
 from tesnet.points import (
     drop_points,
     estimate_normals,
+    in_box,
     members_of_cells,
     nearest_neighbours,
     statistical_outliers,
@@ -41,7 +42,7 @@ _DEVIATIONS = 3.0
 _FEWEST_BELOW = 200
 _NEAR_SUPPORT = 0.03
 
-MOST_ON_SUPPORT = 5_000
+MOST_ON_SUPPORT = 4_000
 """Of what stands on a support that was found, so many prepared points, the nearest to the camera: enough for any grasp,
 in twice the time of a tabletop scene of 30 cm."""
 
@@ -176,7 +177,7 @@ def prepare(
     def to_canonical(positions: Tensor) -> Tensor:
         return in_canonical_frame(positions, T_cloud_canonical)
 
-    table = _quieter(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config, support_sd)
+    table = _quieter(torch.cat([to_canonical(points), table[:, 3:]], dim=1), config, support_sd, between)
     table = voxel_downsample(table, config.voxel_size)
     between()
     a_cell = len(points) / len(table)
@@ -233,12 +234,12 @@ def _support_sd(points: Tensor, query: GraspQuery) -> float:
     return 1.4826 * float(below.median()) if len(below) >= _FEWEST_BELOW else 0.0
 
 
-def _quieter(table: Tensor, config: PreparationConfig, support_sd: float) -> Tensor:
+def _quieter(table: Tensor, config: PreparationConfig, support_sd: float, between: Callable[[], None]) -> Tensor:
     """Rows (N, 3 or more), beginning with x, y, z, as the configuration wants them where they are noisy."""
     if config.smooth_above is None or not MINIMUM_POINTS <= len(table) <= smoothing.MOST_POINTS:
         return table
     noise = smoothing.measured(table[:, :3])
-    table = smoothing.without_lone(table, noise)
+    table = smoothing.without_lone(table, noise, between)
     sd = max(noise.sd, support_sd)
     return smoothing.smoothed(table, sd) if sd > config.smooth_above and len(table) else table
 
@@ -303,7 +304,7 @@ def _unsought(points: Tensor, others: Tensor, voxel_size: float, a_cell: float) 
     Isolated are those whose surroundings, a cube of `_SURROUNDINGS` cells' edge, hold fewer than `_FEWEST_TOGETHER`
     points, or under a tenth of what a surface that crosses it holds where there are `a_cell` points in a cell.
     """
-    near = ((others >= points.amin(dim=0) - _LONGEST_HAND) & (others <= points.amax(dim=0) + _LONGEST_HAND)).all(dim=1)
+    near = in_box(others, points.amin(dim=0) - _LONGEST_HAND, points.amax(dim=0) + _LONGEST_HAND)
     others = others[near]
     if len(others) == 0:
         return None
@@ -316,7 +317,7 @@ def _unsought(points: Tensor, others: Tensor, voxel_size: float, a_cell: float) 
 def _inside(points: Tensor, box: Box) -> Tensor:
     low = torch.tensor(box.minimum, dtype=points.dtype, device=points.device)
     high = torch.tensor(box.maximum, dtype=points.dtype, device=points.device)
-    return ((points[:, :3] >= low) & (points[:, :3] <= high)).all(dim=1)
+    return in_box(points, low, high)
 
 
 def in_canonical_frame(points: Tensor, T_cloud_canonical: Pose) -> Tensor:

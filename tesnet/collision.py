@@ -16,7 +16,7 @@ from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper, Part
 from tesnet.obstacles import Obstacles
-from tesnet.points import points_in_grasp_frames
+from tesnet.points import in_box, points_in_grasp_frames
 from tesnet.swept import inside_hand, inside_palm
 from tesnet.visibility import hidden
 
@@ -135,30 +135,31 @@ def _meets(obstacles: Obstacles, candidates: Candidates, asked: Tensor, between:
     return met
 
 
-def holds(posted: Obstacles, candidates: Candidates, between: Callable[[], None] = lambda: None) -> Tensor:
+def holds(posted: Tensor, candidates: Candidates, between: Callable[[], None] = lambda: None) -> Tensor:
     """Mask (C,): posted points lie well inside the open hand at the grasp, `HELD_POINTS` or more `HELD_DEPTH` deep.
 
     The last word on grasps that are to be returned: `blocked` looks at cells, and leaves out points that stand alone.
 
     Args:
-        posted: every point of the query that is in reach of the hands, its support's included.
+        posted: (N, 3) every point of the query, its support's included.
         candidates: C of them.
         between: called between blocks of work of some milliseconds.
     """
     poses, widths = candidates.Ts_canonical_grasp, candidates.widths
-    held = posted.count_in_hands(poses, candidates.gripper, widths, depth=HELD_DEPTH, between=between)
+    posted = _in_reach(posted, candidates)
+    held = Obstacles.of(posted).count_in_hands(poses, candidates.gripper, widths, depth=HELD_DEPTH, between=between)
     return held >= HELD_POINTS
 
 
-def in_reach(posted: Tensor, candidates: Candidates) -> Obstacles:
+def _in_reach(posted: Tensor, candidates: Candidates) -> Tensor:
     """Those of the posted points (N, 3) that the hands of the candidates, one at least, may hold."""
+    if len(candidates) == 0:
+        return posted[:0]
     Ts_canonical_grasp, gripper = candidates.Ts_canonical_grasp, candidates.gripper
     corners = torch.tensor(gripper.corners(gripper.max_width), dtype=posted.dtype, device=posted.device)
     places = corners @ Ts_canonical_grasp[:, :3, :3].transpose(1, 2) + Ts_canonical_grasp[:, None, :3, 3]
     low, high = places.amin(dim=(0, 1)), places.amax(dim=(0, 1))
-    for axis in range(3):
-        posted = posted[(posted[:, axis] >= low[axis]) & (posted[:, axis] <= high[axis])]
-    return Obstacles.of(posted)
+    return posted[in_box(posted, low, high)]
 
 
 def in_collision(

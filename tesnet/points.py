@@ -7,14 +7,13 @@ from __future__ import annotations
 
 from collections.abc import Callable, Iterator
 
+import numpy as np
 import torch
+from small_gicp import KdTree
 from torch import Tensor
 
-_FEW_POINTS = 700
-"""Up to so many points are compared with each other, all with all."""
-
-_MARGIN = 0.015
-"""Of more points, queries are compared with the points about them first."""
+_QUERIES_AT_ONCE = 1_000
+"""Neighbours of so many are looked for in one or two milliseconds, in which no other Python thread runs."""
 
 _SLAB_QUERIES, _STRIP_QUERIES = 384, 64
 
@@ -43,6 +42,14 @@ def cells_of(points: Tensor, voxel_size: float) -> tuple[Tensor, Tensor]:
     return (sums / counts[:, None]).to(points.dtype), counts
 
 
+def in_box(points: Tensor, low: Tensor, high: Tensor) -> Tensor:
+    """Mask (N,) of the points (N, 3 or more) between two corners (3,)."""
+    inside = torch.ones(len(points), dtype=torch.bool, device=points.device)
+    for axis in range(3):  # several times as fast as all axes at once
+        inside &= (points[:, axis] >= low[axis]) & (points[:, axis] <= high[axis])
+    return inside
+
+
 def members_of_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
     """Of integer cells (P, 3): the number (P,) of each row among the occupied cells, in order, and their sizes."""
     cells = cells - cells.min(dim=0).values
@@ -58,31 +65,44 @@ def nearest_neighbours(
     """Indices (Q, k) of the points (P, 3) nearest to each query (Q, 3), nearest first.
 
     Queries default to the points themselves; each is then its own first neighbour. With fewer than k points the last
-    one is repeated.
-
-    Queries are compared with the points about them only; the few whose k-th neighbour may lie farther away, and all
-    queries of few points, are compared with all. `between` is called between the blocks.
+    one is repeated. `between` is called between blocks of queries.
     """
-    sources = points if queries is None else queries
     available = min(k, len(points))
-    # Squared distances come from an expanded square, whose terms cancel: float64.
-    exact, wanted = points.double(), sources.double()
-    neighbours = torch.empty(len(sources), available, dtype=torch.long, device=points.device)
-    few = len(points) <= _FEW_POINTS
-    unsure = [torch.arange(len(sources), device=points.device)] if few else []
-    for rows, around in () if few else strips(exact, wanted, _MARGIN, between):
-        if len(around) < available:
-            unsure.append(rows)
-            continue
-        squares, found = _nearest(wanted[rows], exact[around], available)
-        neighbours[rows] = around[found]
-        unsure.append(rows[squares[:, -1] >= _MARGIN**2])
-    for rows in torch.cat(unsure).split(max(1, _LARGEST_TABLE // len(points))) if unsure else ():
-        between()
-        neighbours[rows] = _nearest(wanted[rows], exact, available)[1]
+    find = _by_distances if points.is_cuda else _by_tree
+    neighbours = find(points, points if queries is None else queries, available, between)
     if queries is None:
         neighbours = _self_first(neighbours)
     return neighbours if available == k else torch.cat([neighbours, neighbours[:, -1:].expand(-1, k - available)], 1)
+
+
+def _by_tree(points: Tensor, queries: Tensor, k: int, between: Callable[[], None]) -> Tensor:
+    """On the CPU, by a k-d tree."""
+    found = [np.empty((0, k), dtype=np.uint64)]
+    if len(points):
+        tree = KdTree(points.double().numpy())
+        for block in queries.double().split(_QUERIES_AT_ONCE):
+            between()
+            found.append(tree.batch_knn_search(block.numpy(), k, num_threads=torch.get_num_threads())[0])
+    return torch.from_numpy(np.concatenate(found).astype(np.int64))
+
+
+def _by_distances(points: Tensor, queries: Tensor, k: int, between: Callable[[], None]) -> Tensor:
+    """On a GPU, by all distances."""
+    exact, wanted = points.double(), queries.double()
+    found = [torch.empty(0, k, dtype=torch.long, device=points.device)]
+    for block in wanted.split(max(1, _LARGEST_TABLE // len(points))):
+        between()
+        found.append(squared_distances(block, exact).topk(k, largest=False).indices)
+    return torch.cat(found)
+
+
+def count_within(points: Tensor, radius: float, between: Callable[[], None] = lambda: None) -> Tensor:
+    """How many points (P, 3) lie within the radius of each, itself included: (P,). `between` as above."""
+    exact = points.double()
+    counts = torch.zeros(len(points), dtype=torch.long, device=points.device)
+    for rows, around in strips(exact, exact, radius, between):
+        counts[rows] = (squared_distances(exact[rows], exact[around]) <= radius**2).sum(dim=1)
+    return counts
 
 
 def strips(
@@ -112,12 +132,6 @@ def squared_distances(queries: Tensor, points: Tensor) -> Tensor:
     left = torch.cat([queries, queries.square().sum(dim=1, keepdim=True), torch.ones_like(queries[:, :1])], dim=1)
     right = torch.cat([-2 * points, torch.ones_like(points[:, :1]), points.square().sum(dim=1, keepdim=True)], dim=1)
     return left @ right.T
-
-
-def _nearest(queries: Tensor, points: Tensor, k: int) -> tuple[Tensor, Tensor]:
-    """Squared distances and indices (Q, k) of the nearest points, both in ascending order of distance."""
-    nearest = squared_distances(queries, points).float().topk(k, largest=False)
-    return nearest.values, nearest.indices
 
 
 def _self_first(neighbours: Tensor) -> Tensor:

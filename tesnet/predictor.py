@@ -392,11 +392,10 @@ def _ranked_clear(
 
     Grasps are held against the points as they come to be ranked; from the `_RANKINGS`th time on, all of them.
     """
-    obstacles = collision.in_reach(posted, found.free)
     for number in itertools.count(1):
         ranked = _ranked(found, scores, query)
         asked = (ranked.indices if number < _RANKINGS else torch.arange(len(scores))).to(scores.device)
-        held = collision.holds(obstacles, found.free.select(asked), clock.check)
+        held = collision.holds(posted, found.free.select(asked), clock.check)
         if not bool(held.any()):
             break
         clear = torch.ones(len(scores), dtype=torch.bool, device=scores.device)

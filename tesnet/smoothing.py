@@ -6,12 +6,13 @@ inputs; lengths in metres.
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import dataclass
 
 import torch
 from torch import Tensor
 
-from tesnet.points import cells_of, nearest_neighbours, smallest_eigenvector, squared_distances, strips
+from tesnet.points import cells_of, count_within, smallest_eigenvector, squared_distances, strips
 
 MOST_LONE = 0.0125
 """Share of lone points from which on they are flying pixels. Of quiet clouds 0.4 % are lone, on surfaces at a slant."""
@@ -60,42 +61,43 @@ def measured(points: Tensor) -> Noise:
     A block of the sample is compared with the slab of points around it only.
     """
     cloud = points[points[:, 0].argsort()].double() - points.double().mean(dim=0)
-    by_x = cloud[:, 0].contiguous()
+    by_x, places = cloud[:, 0].contiguous(), cloud.float()
+    moments = torch.cat(
+        [torch.ones_like(cloud[:, :1]), cloud, (cloud[:, :, None] * cloud[:, None, :]).flatten(1)], dim=1
+    )
     sample = torch.linspace(0, len(points) - 1, min(_SAMPLE, len(points)), device=points.device).long()
-    crowds, spreads = [], []
+    crowds, sums = [], []
     for block in sample.split(_BLOCK):
         ends = torch.stack([by_x[block[0]] - _FLAT_RADIUS, by_x[block[-1]] + _FLAT_RADIUS])
         first, last = torch.searchsorted(by_x, ends).tolist()
-        slab = (cloud[first:last] - cloud[block].mean(dim=0)).float()
-        squares = torch.cdist(slab[block - first], slab).square()
-        crowds.append((squares <= _LONE_RADIUS**2).sum(dim=1) - 1)
-        spreads.append(_covariances(slab, squares <= _FLAT_RADIUS**2))
+        distances = torch.cdist(places[block], places[first:last])
+        crowds.append((distances <= _LONE_RADIUS).sum(dim=1) - 1)
+        sums.append((distances <= _FLAT_RADIUS).double() @ moments[first:last])
     others = torch.cat(crowds).double()
-    residuals = smallest_eigenvector(torch.cat(spreads).double())[0][:, 0].sqrt()
+    residuals = smallest_eigenvector(_covariances(torch.cat(sums)))[0][:, 0].sqrt()
     crowd = float(others.median())
     # Of a sparse cloud every point is alone.
     lone = float((others <= _LONE_SHARE * crowd).double().mean()) if _LONE_SHARE * crowd >= 1 else 0.0
     return Noise(float(residuals.quantile(_QUARTER)) if len(residuals) else 0.0, lone, crowd)
 
 
-def _covariances(points: Tensor, members: Tensor) -> Tensor:
-    """(B', 3, 3) of the points (P, 3) of each mask (B, P) that has enough of them, as after a plane's three numbers."""
-    counts = members.sum(dim=1)
-    members, counts = members[counts >= _FEWEST].to(points), counts[counts >= _FEWEST, None].to(points)
-    means = members @ points / counts
-    moments = (members @ (points[:, :, None] * points[:, None, :]).flatten(1) / counts).view(-1, 3, 3)
-    scale = counts / (counts - 3)
-    return (moments - means[:, :, None] * means[:, None, :]) * scale[..., None]
+def _covariances(sums: Tensor) -> Tensor:
+    """(B', 3, 3) of sums (B, 13) of ones, places and products; of enough points, as after a plane's three numbers."""
+    sums = sums[sums[:, 0] >= _FEWEST]
+    counts, (means, products) = sums[:, :1], (sums[:, 1:] / sums[:, :1]).split([3, 9], dim=1)
+    spread = products.view(-1, 3, 3) - means[:, :, None] * means[:, None, :]
+    unbiased: Tensor = spread * (counts / (counts - 3))[..., None]
+    return unbiased
 
 
-def without_lone(table: Tensor, noise: Noise) -> Tensor:
-    """The rows (N, 3 or more), which begin with x, y, z, without flying pixels, where there are any."""
+def without_lone(table: Tensor, noise: Noise, between: Callable[[], None] = lambda: None) -> Tensor:
+    """The rows (N, 3 or more), which begin with x, y, z, without flying pixels, where there are any.
+
+    `between` is called between blocks of work of some tens of milliseconds.
+    """
     if noise.lone <= MOST_LONE:
         return table
-    fewest = int(_LONE_SHARE * noise.crowd) + 1
-    points = table[:, :3].contiguous()
-    farthest = points[nearest_neighbours(points, fewest + 1)[:, -1]]
-    return table[(farthest - points).norm(dim=1) <= _LONE_RADIUS]
+    return table[count_within(table[:, :3], _LONE_RADIUS, between) - 1 > _LONE_SHARE * noise.crowd]
 
 
 def smoothed(table: Tensor, sd: float) -> Tensor:

@@ -82,7 +82,7 @@ class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig(smooth_above=0.0011)
-    scored_at_once: ClassVar[int] = 2_500
+    scored_at_once: ClassVar[int] = 500
 
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()

@@ -107,6 +107,30 @@ def test_neighbours_in_a_large_cloud_with_dense_and_sparse_parts_are_scipys() ->
     np.testing.assert_allclose(np.linalg.norm(exact[found] - exact[:, None], axis=2), distances, atol=1e-7)
 
 
+def test_a_box_holds_what_lies_between_its_corners_borders_included() -> None:
+    points = torch.cat([uniform(200, 1), torch.tensor([[0.5, 0.2, 0.3], [0.2, 0.5, 0.3], [0.2, 0.2, 0.5001]])])
+    low, high = torch.tensor([0.0, 0.1, 0.2]), torch.tensor([0.5, 0.5, 0.5])
+    expected = [all(low[i] <= p[i] <= high[i] for i in range(3)) for p in points]
+    assert pts.in_box(points, low, high).tolist() == expected
+    assert expected[-3:] == [True, True, False]
+
+
+def test_a_gpus_neighbours_are_those_of_the_tree() -> None:
+    points, queries = torch.cat([uniform(1500, 3), uniform(500, 4, extent=0.01) + 3]), uniform(300, 5)
+    for asked in (points, queries):
+        by_tree, by_distances = (find(points, asked, 16, lambda: None) for find in (pts._by_tree, pts._by_distances))
+        assert torch.equal(by_tree, by_distances)
+
+
+@given(count=st.sampled_from([1, 40, 1500]), radius=st.sampled_from([0.05, 0.2, 3.0]), seed=st.integers(0, 999))
+@FEW
+def test_counts_within_a_radius_are_scipys(count: int, radius: float, seed: int) -> None:
+    points = uniform(count, seed) + 4
+    exact = points.double().numpy()
+    expected = cKDTree(exact).query_ball_point(exact, radius, return_length=True)
+    assert pts.count_within(points, radius).tolist() == expected.tolist()
+
+
 def test_coincident_points_are_their_own_first_neighbour() -> None:
     points = torch.zeros(40, 3)
     found = pts.nearest_neighbours(points, 5)
