@@ -216,6 +216,60 @@ def test_every_epoch_shows_other_draws_and_a_seed_repeats_them(tmp_path: Path) -
     assert len(set(mirrors)) == len(mirrors)
 
 
+class Sloping(torch.nn.Module):
+    """A network of two parameters whose logits differ from cloud to cloud, and between training and judging."""
+
+    def __init__(self, steepness: float) -> None:
+        super().__init__()
+        self.steepness = steepness
+        self.slopes = torch.nn.Parameter(torch.tensor([0.3, -0.2]))
+        self.was_training: list[bool] = []
+
+    def encode_batch(self, clouds: list[PreparedCloud]) -> list[None]:
+        return [None] * len(clouds)
+
+    def score(self, features: None, cloud: PreparedCloud, candidates: Candidates, mirror: torch.Tensor) -> torch.Tensor:
+        self.was_training.append(self.training)
+        inputs = torch.tensor([1.0, len(cloud) / 1000]).expand(len(candidates), 2)
+        return self.steepness * inputs @ self.slopes
+
+
+@pytest.mark.parametrize("share", [0.2, 0.5, 0.9])
+@pytest.mark.parametrize("steepness", [0.1, 30.0])
+def test_a_step_goes_along_the_mean_slope_of_its_views_which_is_at_most_one_long(
+    tmp_path: Path, steepness: float, share: float
+) -> None:
+    """Of the mean cross-entropy at the prior of the labels, by plain gradient descent, worked out by hand."""
+    views = [labelled_view(seed, positives=10 + 15 * seed) for seed in range(2)]
+    network, network_before = Sloping(steepness).eval(), Sloping(steepness)
+    recipe = replace(RECIPE, candidates_per_view=60, cosine=False)
+    progress = fitting._Progress({}, 0, learning_rate=0.5)
+    optimiser = torch.optim.SGD(network.parameters(), lr=9.0)
+    loss = fitting._epoch(network, optimiser, recipe, views, share, progress, None, tmp_path / "a", cores=Threads(1))  # type: ignore[arg-type]
+    assert network.was_training == [True, True]
+    slopes = network_before.slopes.detach().double().numpy()
+    mean_slope, mean_loss = np.zeros(2), 0.0
+    for view in views:
+        inputs = np.array([1.0, len(view.cloud) / 1000])
+        chance = 1 / (1 + math.exp(-(steepness * inputs @ slopes)) * (1 - share) / share)
+        successes = float(view.success.double().mean())
+        mean_slope += (chance - successes) * steepness * inputs / 2
+        mean_loss -= (successes * math.log(chance) + (1 - successes) * math.log(1 - chance)) / 2
+    length = np.linalg.norm(mean_slope)
+    assert (length > 1) == (steepness > 1)
+    step = network.slopes.detach().numpy() - slopes
+    np.testing.assert_allclose(step, -0.5 * mean_slope / max(1.0, length), rtol=1e-3, atol=1e-6)
+    assert loss == pytest.approx(mean_loss, rel=1e-4)
+
+
+@pytest.mark.parametrize(("name", "kind"), [("adam", torch.optim.Adam), ("adamw", torch.optim.AdamW)])
+def test_the_optimiser_is_that_of_the_recipe(name: Any, kind: type[torch.optim.Optimizer]) -> None:
+    made = fitting._optimiser(networks.build("tesnet"), Recipe(optimiser=name, learning_rate=0.01, weight_decay=0.07))
+    assert type(made) is kind
+    assert made.defaults["lr"] == 0.01
+    assert made.defaults["weight_decay"] == (0.07 if name == "adamw" else 0.0)
+
+
 @pytest.mark.parametrize("approach_points", [None, 1000])
 @pytest.mark.parametrize(("free", "blocked"), [(20, 10), (20, 0), (100, 100)])
 def test_free_and_blocked_candidates_are_shown_in_the_numbers_of_the_recipe(

@@ -127,6 +127,19 @@ def test_the_edge_metric_averages_over_views_and_repeats_for_a_seed() -> None:
     assert metrics.edge_metric(uneven, 1) != metrics.edge_metric(uneven, 2)
 
 
+@given(view=scored(), seed=st.integers(0, 99))
+@FEW
+def test_the_edge_metric_counts_those_above_its_threshold(view: tuple[Logits, Success], seed: int) -> None:
+    """A balanced view is taken whole; logits from 0 to 0.5 are called failures, though they are likelier successes."""
+    logits, success = metrics.balanced_view(*view, np.random.default_rng(seed))
+    logits = np.append(logits, [0.4, -0.1])
+    success = np.append(success, [True, False])
+    right = [(logit > 0.5) == bool(outcome) for logit, outcome in zip(logits, success, strict=True)]
+    accuracy, loss = metrics.edge_metric([(logits, success)], seed)
+    assert accuracy == pytest.approx(np.mean(right))
+    assert loss == pytest.approx(metrics.cross_entropy(logits, success))
+
+
 @given(view=scored())
 @FEW
 def test_served_measures_are_those_of_the_calibrated_scores(view: tuple[Logits, Success]) -> None:

@@ -37,6 +37,9 @@ def test_labels_round_trip(tmp_path: Path) -> None:
         torch.testing.assert_close(after.cloud.points, before.cloud.points, atol=7e-5, rtol=0)
         tried, stored = before.candidates.Ts_canonical_grasp, after.candidates.Ts_canonical_grasp
         assert torch.equal(stored, tried)
+        # Directions are of unit length to rounding, whatever float16 kept of them.
+        for directions in (after.cloud.normals, after.cloud.view_directions):
+            torch.testing.assert_close(directions.norm(dim=1), torch.ones(len(directions)), atol=1e-6, rtol=0)
         facing = (after.cloud.normals * after.cloud.view_directions).sum(dim=1)
         assert (facing >= 0).all()
         agree = (after.cloud.normals * before.cloud.normals).sum(dim=1)
