@@ -3,6 +3,7 @@ from __future__ import annotations
 import json
 import operator
 import pickle
+import time
 from collections.abc import Callable
 from datetime import datetime, timedelta, timezone
 from email.utils import format_datetime
@@ -178,3 +179,20 @@ def test_retry_after_as_a_date(refusing: Callable[..., Answering]) -> None:
     later = retry_after(now + timedelta(hours=1))
     assert later is not None
     assert 3000 < later <= 3600
+
+
+@pytest.mark.parametrize("here", ["UTC0", "JST-9", "EST5"])
+@pytest.mark.parametrize("form", ["%a, %d %b %Y %H:%M:%S GMT", "%a, %d %b %Y %H:%M:%S -0000", "%a %b %d %H:%M:%S %Y"])
+def test_a_date_to_retry_after_is_that_of_greenwich_wherever_the_client_runs(
+    here: str, form: str, refusing: Callable[..., Answering], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """In each of the forms that HTTP knows, two of which name no zone of their own."""
+    text = (datetime.now(timezone.utc) + timedelta(hours=1)).strftime(form)
+    with monkeypatch.context() as patch:
+        patch.setenv("TZ", here)
+        time.tzset()
+        error = problem(Answer(503, {"retry-after": text}, refusing(503).body))
+    time.tzset()
+    assert isinstance(error, client.Overloaded)
+    assert error.retry_after is not None
+    assert 3000 < error.retry_after <= 3600

@@ -7,14 +7,25 @@ from urllib.parse import parse_qs, urlsplit
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 from hypothesis.extra import numpy as npst
 
 from client.errors import InvalidArgument
-from client.request import GraspOptions, GripperSize, Intrinsics, checked_points, header_value, points_request
+from client.request import (
+    LONGEST_QUERY,
+    GraspOptions,
+    GripperSize,
+    Intrinsics,
+    Request,
+    checked_points,
+    depth_request,
+    header_value,
+    points_request,
+)
 from service import schemas
-from service.payloads import decoder_for
+from service.payloads import Payload, decoder_for
+from tesnet.geometry import CameraIntrinsics, Pose
 
 CLOUD = np.zeros((2, 3), dtype=np.float32)
 EVERY_OPTION: dict[str, Any] = {
@@ -133,6 +144,74 @@ def test_every_option_reaches_the_wire_as_the_schema_reads_it() -> None:
     assert parsed.gripper == schemas.GripperSize(max_width=0.06, finger_depth=float(np.float32(0.04)))
     assert parsed.max_grasps == 7
     assert parsed.frame_convention == "graspnet"
+
+
+def as_sent(request: Request) -> tuple[Payload, dict[str, Any]]:
+    """What the service makes of a request: its points, and the options that stand in its URL or its form."""
+    payload = decoder_for(request.headers["Content-Type"])(bytearray(request.content), 100_000)
+    in_url = parse_qs(urlsplit(request.target).query)
+    options = {name: json.loads(values[0]) for name, values in in_url.items()}
+    return payload, options | {name: json.loads(bytes(value)) for name, value in payload.options.items()}
+
+
+def plain(value: Any) -> Any:
+    """Arrays as lists, tuples too: as JSON has them."""
+    return json.loads(json.dumps(value, default=lambda array: array.tolist()))
+
+
+@pytest.mark.parametrize("name", EVERY_OPTION)
+@pytest.mark.parametrize("way", ["points", "form", "depth"])
+def test_every_option_arrives_as_it_was_given_however_it_travels(name: str, way: str) -> None:
+    options = {name: EVERY_OPTION[name]}
+    if way == "depth":
+        camera = {"fx": 50.0, "fy": 50.0, "cx": 1.0, "cy": 1.0}
+        request = depth_request(np.ones((4, 4)), camera, options)
+    else:
+        request = points_request(CLOUD, options, normals=np.eye(2, 3) if way == "form" else None)
+    assert as_sent(request)[1] == plain(options)
+
+
+@pytest.mark.parametrize("value", [0, 0.0, False, [0.0, 0.0, 0.0]])
+@pytest.mark.parametrize("name", ["seed", "calibrate", "viewpoint", "min_score", "support_height"])
+def test_a_zero_is_no_option_that_was_left_out(name: str, value: Any) -> None:
+    assert as_sent(points_request(CLOUD, {name: value}))[1] == {name: value}
+
+
+@given(st.integers(0, 1500), st.integers(0, 30), st.integers(10, 99_999))
+@settings(max_examples=60, deadline=None)
+def test_no_url_is_longer_than_any_proxy_takes_and_no_option_is_lost(count: int, near: int, largest: int) -> None:
+    """Of around 800 or 1,400 indices on, as they have five digits or three, they travel in a form."""
+    for number in (count, max(0, near + round(LONGEST_QUERY / (3 + len(str(largest)))) - 15)):
+        options = {"target": {"indices": [largest] * number}, "seed": 3}
+        request = points_request(CLOUD, options)
+        assert len(request.target) <= len("/grasps?") + LONGEST_QUERY <= 4100
+        payload, arrived = as_sent(request)
+        assert arrived == options
+        np.testing.assert_array_equal(payload.points, CLOUD)
+        assert (request.target == "/grasps") == ("multipart" in request.headers["Content-Type"])
+
+
+@pytest.mark.parametrize("stride", range(1, 6))
+@pytest.mark.parametrize("moved", [False, True])
+@pytest.mark.parametrize("scale", [0.001, 0.00025])
+def test_the_service_sees_a_depth_image_as_the_caller_described_it(stride: int, moved: bool, scale: float) -> None:
+    rng = np.random.default_rng(stride)
+    depth = np.where(rng.random((11, 7)) < 0.8, rng.uniform(0.3, 2.0, (11, 7)), 0.0)
+    labels = rng.integers(0, 4, (11, 7)).astype(np.uint8)
+    camera = CameraIntrinsics(7, 11, fx=60.0, fy=70.0, cx=3.2, cy=5.1)
+    pose = Pose.random(rng, reach=0.5) if moved else None
+    request = depth_request(depth, camera, {}, mask=labels, T_cloud_camera=pose, depth_scale=scale, stride=stride)
+    payload, _ = as_sent(request)
+    used = np.zeros((11, 7), dtype=bool)
+    used[::stride, ::stride] = depth[::stride, ::stride] > 0
+    assert payload.is_point is not None
+    assert payload.mask is not None
+    assert payload.is_point.tolist() == used.ravel().tolist()
+    assert payload.mask.tolist() == labels.ravel().tolist()
+    points = camera.back_project(np.where(used, depth, 0.0))
+    np.testing.assert_allclose(payload.points, points if pose is None else pose.apply(points), atol=4 * scale)
+    assert payload.viewpoint is not None
+    np.testing.assert_allclose(payload.viewpoint, np.zeros(3) if pose is None else pose.translation, atol=1e-9)
 
 
 def test_options_that_are_absent_or_none_are_left_to_the_service() -> None:

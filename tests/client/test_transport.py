@@ -1,12 +1,16 @@
 from __future__ import annotations
 
+import socket
 import time
 
+import httpcore
 import httpx
 import pytest
 
+from client import transport
 from client.errors import InvalidArgument
 from client.transport import Deadline, TimeLeft, is_this_machine, proxy_for, tls_context
+from tests.conftest import PATIENCE_S
 
 ELSEWHERE = httpx.URL("http://robot.example:8000")
 VARIABLES = ("HTTP_PROXY", "HTTPS_PROXY", "ALL_PROXY", "NO_PROXY")
@@ -31,6 +35,32 @@ def test_a_time_out_is_what_is_left_when_it_is_looked_up(monkeypatch: pytest.Mon
     assert left.get("other") is None
     now = 105.0
     assert left.get("read") > 0  # none at all would mean: do not wait, and another error
+
+
+@pytest.mark.parametrize("place", range(3))
+def test_each_address_of_a_host_is_tried_until_one_takes_the_connection(
+    place: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """As where a name has an IPv6 address, and the service listens on IPv4 alone."""
+    addresses = ["127.0.0.2", "127.0.0.3"]
+    addresses.insert(place, "127.0.0.1")
+    found: dict[str, list[str]] = {"robot.example": addresses, "nowhere.example": []}
+    monkeypatch.setattr(transport, "_addresses", lambda host, port: found[host])
+    with socket.create_server(("127.0.0.1", 0)) as server:
+        port = server.getsockname()[1]
+        stream = transport._Backend().connect_tcp("robot.example", port, PATIENCE_S)
+        assert stream.get_extra_info("server_addr") == ("127.0.0.1", port)
+        stream.close()
+    for host, words in (("robot.example", "refused"), ("nowhere.example", "has no address")):
+        with pytest.raises(httpcore.ConnectError, match=words):
+            transport._Backend().connect_tcp(host, port, PATIENCE_S)
+
+
+def test_the_addresses_of_a_host_are_those_of_its_name_each_once() -> None:
+    assert set(transport._addresses("localhost", 80)) <= {"127.0.0.1", "::1"}
+    assert transport._addresses("127.0.0.7", 80) == ["127.0.0.7"]
+    with pytest.raises(httpcore.ConnectError):
+        transport._addresses("no-such-host.invalid", 80)
 
 
 @pytest.mark.parametrize(

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import re
 from collections.abc import Callable
+from pathlib import Path
 from typing import Any
 
 import httpx
@@ -16,6 +17,8 @@ from service.settings import load_settings
 from service.viewer import PAGE_PATHS
 
 Serve = Callable[..., Any]
+
+ROOT = Path(__file__).parents[2]
 
 BODY = np.zeros((20, 3), np.float32).tobytes()
 OCTETS = {"Content-Type": "application/octet-stream"}
@@ -74,6 +77,17 @@ def test_every_other_route_needs_a_key_too(guarded: str) -> None:
     for path in paths:
         status = httpx.get(f"{guarded}{path}").status_code
         assert (status == 200) if path in OPEN_PATHS else (status == 401), path
+
+
+def test_the_open_routes_are_those_that_the_interface_says_are_open() -> None:
+    """Beneath a page that is open lie its files, and nothing that answers about clouds or models."""
+    section = (ROOT / "docs" / "api.md").read_text().split("## API keys")[1]
+    (sentence,) = re.findall(r"every route wants one of them, but for (.*?), whose page", section, re.DOTALL)
+    said = set(re.findall(r"`(/[^`]*)`", sentence))
+    static = {f"{DOCS_FILES}/{name}" for name in ("swagger-ui-bundle.js", "swagger-ui.css", "favicon.png")}
+    of_pages = static | {"/docs/oauth2-redirect"} | {path for path in PAGE_PATHS if re.search(r"\.\w+$", path)}
+    assert said | of_pages == OPEN_PATHS
+    assert not said & of_pages
 
 
 def test_the_reference_tells_how_a_key_is_given() -> None:

@@ -3,6 +3,8 @@
 from __future__ import annotations
 
 import contextlib
+import dataclasses
+import io
 import itertools
 import json
 import tracemalloc
@@ -10,7 +12,7 @@ from typing import Any
 
 import numpy as np
 import pytest
-from hypothesis import given
+from hypothesis import given, settings
 from hypothesis import strategies as st
 
 from service.errors import Invalid, ServiceError, Undecodable
@@ -19,14 +21,17 @@ from service.payloads import (
     Payload,
     build_query,
     decoder_for,
+    depth_image,
     json_object,
     parse_options,
     parse_query_string,
 )
 from service.payloads.json_body import decode_json
 from service.payloads.options import unknown_option
+from service.payloads.payload import cloud_payload
+from service.payloads.per_point import known_normals
 from tesnet.errors import TesnetError, TooManyPoints
-from tesnet.geometry import Box, Gripper
+from tesnet.geometry import Box, Gripper, Pose
 from tesnet.query import GraspQuery
 
 coordinates = st.floats(-10, 10, width=32) | st.integers(-10, 10)
@@ -255,3 +260,144 @@ def test_options_arrive_in_the_query_and_defaults_are_the_library_s_own() -> Non
     assert isinstance(query.target, Box)
     assert query.target.maximum.tolist() == [1, 1, 1]
     assert query.gripper == Gripper(max_width=0.05, finger_thickness=0.01, finger_tip_thickness=0.01)
+
+
+@st.composite
+def gappy(draw: st.DrawFn) -> tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]:
+    """Rows (R, 3) of which some, anywhere, hold NaN or an infinity; and which are points."""
+    count = draw(st.integers(1, 12))
+    is_point = np.array(draw(st.lists(st.booleans(), min_size=count, max_size=count).filter(any)))
+    rows = np.arange(3.0 * count).reshape(count, 3).astype(np.float32) / 10
+    for row in np.flatnonzero(~is_point):
+        rows[row, draw(st.integers(0, 2))] = draw(st.sampled_from([np.nan, np.inf, -np.inf]))
+    return rows, is_point
+
+
+@given(gappy(), st.data())
+def test_what_belongs_to_a_row_stays_with_it_whichever_rows_are_no_points(
+    cloud: tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]], data: st.DataObject
+) -> None:
+    rows, is_point = cloud
+    count = len(rows)
+    view_index = np.array(data.draw(st.lists(st.integers(0, 2), min_size=count, max_size=count)))
+    indices = data.draw(st.lists(st.integers(0, count - 1), min_size=1, unique=True))
+    normals = np.eye(3, dtype=np.float32)[view_index]
+    raw = {
+        "viewpoint": b"[[0, 0, 1], [1, 0, 1], [0, 1, 1]]",
+        "target": json.dumps({"indices": indices}).encode(),
+    }
+    payload = cloud_payload(rows, raw, {"view_index": view_index, "normals": normals})
+    query = build_query(payload, parse_options(payload.options))
+    assert query.view_index is not None
+    assert query.normals is not None
+    assert query.ignored_points == int((~is_point).sum())
+    expected = [row for row in range(count) if is_point[row]]
+    assert query.points.tolist() == [rows[row].tolist() for row in expected]
+    assert query.view_index.tolist() == [view_index[row] for row in expected]
+    assert query.normals.tolist() == [normals[row].tolist() for row in expected]
+    assert isinstance(query.target, np.ndarray)
+    assert query.target.tolist() == [row in indices for row in expected]
+
+
+@given(gappy(), st.data())
+def test_a_label_marks_the_points_of_the_rows_that_have_it(
+    cloud: tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]], data: st.DataObject
+) -> None:
+    rows, is_point = cloud
+    labels = np.array(data.draw(st.lists(st.integers(0, 3), min_size=len(rows), max_size=len(rows))))
+    wanted = data.draw(st.sampled_from([None, 0, 1, 2, 3]))
+    raw = {} if wanted is None else {"target": json.dumps({"label": wanted}).encode()}
+    payload = dataclasses.replace(cloud_payload(rows, raw), mask=labels)
+    query = build_query(payload, parse_options(payload.options))
+    assert isinstance(query.target, np.ndarray)
+    marked = [bool(labels[row]) if wanted is None else labels[row] == wanted for row in range(len(rows))]
+    assert query.target.tolist() == [marked[row] for row in range(len(rows)) if is_point[row]]
+    assert any("which no pixel of the mask has" in note for note in query.notes) == (
+        wanted is not None and not any(marked)
+    )
+
+
+@pytest.mark.parametrize("given_one", [None, [0.5, 0.0, 0.7], [[0.5, 0.0, 0.7], [0.0, 0.5, 0.7]], [0.25, 0.0, 0.5]])
+@pytest.mark.parametrize("of_file", [None, [0.25, 0.0, 0.5]])
+@pytest.mark.parametrize("of_image", [None, [0.0, 0.0, 0.125]])
+def test_a_viewpoint_that_is_asked_for_goes_before_that_of_the_file_and_that_before_the_image_s(
+    given_one: Any, of_file: Any, of_image: Any
+) -> None:
+    payload = Payload(
+        np.zeros((4, 3), np.float32),
+        options={} if given_one is None else {"viewpoint": json.dumps(given_one).encode()},
+        viewpoint=None if of_image is None else np.array(of_image),
+        file_viewpoint=None if of_file is None else np.array(of_file),
+    )
+    query = build_query(payload, parse_options(payload.options))
+    expected = next((one for one in (given_one, of_file, of_image) if one is not None), None)
+    if expected is None:
+        assert query.viewpoints is None
+    else:
+        assert query.viewpoints is not None
+        assert query.viewpoints.tolist() == np.array(expected).reshape(-1, 3).tolist()
+    told = [note for note in query.notes if "of the file" in note]
+    if of_file is None or given_one == of_file:
+        assert told == []
+    else:
+        (note,) = told
+        assert "[0.25, 0, 0.5]" in note
+        assert ("is ignored" in note) == (given_one is not None)
+    assert (query.up == "auto") == (of_image is not None)
+
+
+@pytest.mark.parametrize("kind", [np.uint16, np.float32])
+@given(st.data())
+@settings(max_examples=40, deadline=None)
+def test_a_depth_image_gives_the_points_of_a_loop_over_its_pixels(kind: type[np.generic], data: st.DataObject) -> None:
+    """Of any size, stride, camera and pose, however many rows are worked on in one go."""
+    height, width = data.draw(st.integers(1, 9)), data.draw(st.integers(1, 7))
+    stride, block = data.draw(st.integers(1, 4)), data.draw(st.integers(1, 30))
+    rng = np.random.default_rng(data.draw(st.integers(0, 999)))
+    if kind is np.uint16:
+        image = np.where(rng.random((height, width)) < 0.7, rng.integers(200, 2000, (height, width)), 0).astype(kind)
+        scale = data.draw(st.sampled_from([0.001, 0.0005]))
+    else:
+        image = rng.uniform(0.2, 2.0, (height, width)).astype(kind)
+        image[rng.random((height, width)) < 0.3] = data.draw(st.sampled_from([0.0, -1.0, np.nan, np.inf]))
+        scale = 1.0
+    pose = data.draw(st.sampled_from([Pose.identity(), Pose.random(rng, reach=0.5)]))
+    fx, fy, cx, cy = (2.5 * width + 20, 2.2 * width + 20, 0.45 * width + 1, 0.6 * height + 2)
+    camera = {
+        "intrinsics": json.dumps({"fx": fx, "fy": fy, "cx": cx, "cy": cy}).encode(),
+        "depth_scale": json.dumps(scale if kind is np.uint16 else 0.25).encode(),
+        "stride": str(stride).encode(),
+        "T_cloud_camera": json.dumps(pose.matrix.tolist()).encode(),
+    }
+    content = io.BytesIO()
+    np.save(content, image)
+    with pytest.MonkeyPatch.context() as patch:
+        patch.setattr(depth_image, "_BLOCK", block)
+        payload = depth_image.decode_depth(memoryview(content.getvalue()), None, camera, {}, 1000)
+    expected, of_pixel = [], np.zeros(height * width, dtype=bool)
+    for row in range(0, height, stride):
+        for column in range(0, width, stride):
+            depth = float(image[row, column])
+            if np.isfinite(depth) and depth > 0:
+                of_pixel[row * width + column] = True
+                z = depth * scale
+                expected.append([(column - cx) / fx * z, (row - cy) / fy * z, z])
+    places = pose.apply(np.array(expected).reshape(-1, 3))
+    np.testing.assert_allclose(payload.points, places, atol=1e-5)
+    assert payload.is_point is not None
+    assert payload.is_point.tolist() == of_pixel.tolist()
+    assert payload.viewpoint is not None
+    np.testing.assert_allclose(payload.viewpoint, pose.translation, atol=1e-9)
+
+
+@pytest.mark.parametrize("of_image", [False, True])
+@pytest.mark.parametrize("missing", [np.nan, np.inf, -np.inf])
+def test_a_normal_that_is_not_finite_is_none(missing: float, of_image: bool) -> None:
+    """In a .npy file, beside points that are all there: zeros, which the library takes for no normal."""
+    normals = np.tile(np.eye(3, dtype=np.float32), (2, 1))
+    normals[1, 2] = normals[4, 0] = missing
+    found = known_normals(normals.reshape(2, 3, 3) if of_image else normals)
+    expected = np.where(np.isfinite(normals).all(axis=1)[:, None], normals, 0)
+    np.testing.assert_array_equal(found, expected)
+    query = build_query(cloud_payload(np.zeros((6, 3), np.float32), {}, {"normals": found}), parse_options({}))
+    np.testing.assert_array_equal(query.normals, expected)

@@ -32,14 +32,12 @@ def test_whoever_is_passed_for_as_long_as_it_would_have_taken_is_due() -> None:
     turns = Turns(places=8)
     dear = job(8.0)
     turns.add(dear, busy=2.0)
-    passed = 0
-    while True:
+    taken = []
+    for _ in range(11):
         turns.add(job(1.0), busy=0.0)
-        taken = turns.take()
-        if taken is dear:
-            break
-        passed += 1
-    assert passed == 10  # 2 s that it would have waited, and 8 s of its own
+        taken.append(turns.take())
+    # Passed for the 2 s that it would have waited and the 8 s of its own.
+    assert [one is dear for one in taken] == [False] * 10 + [True]
 
 
 def test_whoever_is_due_is_ahead_of_a_cheaper_one_and_others_that_are_dearer_are_not() -> None:
@@ -50,12 +48,25 @@ def test_whoever_is_due_is_ahead_of_a_cheaper_one_and_others_that_are_dearer_are
     cheap = job(1.0)
     ahead = turns.ahead_of(cheap)
     turns.add(cheap, busy=0.0)
-    before = []
-    while (taken := turns.take()) is not cheap:
-        assert taken is not None
-        before.append(taken.expected)
-    assert before == [8.0, 1.0]
-    assert ahead == sum(before)
+    order = [taken.expected for _ in range(3) if (taken := turns.take()) is not None]
+    assert order == [8.0, 1.0, 1.0]
+    assert cheap not in turns
+    assert ahead == sum(order[:2])
+
+
+@given(seconds, seconds, st.floats(0.0, 500.0), st.floats(0.0, 500.0), st.lists(seconds, max_size=5))
+def test_what_a_job_may_be_passed_for_is_what_its_wait_and_its_deadlines_leave(
+    expected: float, busy: float, deadline: float, begin_by: float, waiting: list[float]
+) -> None:
+    turns = Turns(places=8)
+    for other in waiting:
+        turns.add(job(other), busy=busy)
+    asked = Job(QUERY, expected, deadline, begin_by, submitted=3.0)
+    turns.add(asked, busy=busy)
+    in_order = busy + sum(waiting)
+    # Where it begins last of all, it still begins by `begin_by` and ends by its deadline.
+    limits = (in_order + expected, begin_by - 3.0 - in_order, deadline - 3.0 - in_order - expected)
+    assert asked.spare == pytest.approx(max(0.0, min(limits)), abs=1e-9)
 
 
 def test_a_deadline_leaves_less_to_spare() -> None:
@@ -89,8 +100,9 @@ def test_nobody_waits_much_more_than_twice_as_long_as_in_order_of_arrival(events
         one = Job(QUERY, expected, submitted=clock)
         in_order[one] = clock + turns.expected
         turns.add(one, busy=0.0)
-    while len(turns):
+    for _ in range(len(turns)):
         serve()
+    assert len(turns) == 0
 
 
 def test_a_cheap_one_may_interrupt_a_dear_one_while_nobody_is_due() -> None:

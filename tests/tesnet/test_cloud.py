@@ -15,6 +15,7 @@ from torch import Tensor
 from tesnet import cloud
 from tesnet.geometry import Box, Pose
 from tesnet.query import GraspQuery
+from tesnet.support import SupportPlane
 from tests.tesnet.raycast import Can, around, cast
 from tests.tesnet.scenes import (
     CAMERA,
@@ -220,3 +221,19 @@ def test_the_canonical_frame_is_one_however_far_and_small_the_cloud_is(
     along = torch.nn.functional.normalize(torch.tensor(direction).double(), dim=0)
     for up in (None, torch.tensor([0.0, 0.0, 1.0]), along):
         cloud.canonical_frame(points, torch.zeros(1, 3, dtype=torch.float64), up)
+
+
+@pytest.mark.parametrize("noise_sd", [0.0, 0.001, 0.003, 0.006])
+def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: float) -> None:
+    """Whether grasps are looked for there or not; a plane of little noise keeps the usual distance."""
+    points = np.random.default_rng(0).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.06], (20_000, 3))
+    sides = np.array([[1.0, 0, 0, 0.2], [-1.0, 0, 0, 0.2], [0, 1.0, 0, 0.2], [0, -1.0, 0, 0.2]])
+    plane = SupportPlane(UP, 0.0, 0.5, noise_sd, sides)
+    query = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0)
+    ready = cloud.prepare(query, cloud.PreparationConfig(), CPU, plane)
+    assert ready is not None
+    positions = [ready.points] if ready.unsought is None else [ready.points, ready.unsought.points]
+    heights = ready.T_cloud_canonical.apply(torch.cat(positions).numpy())[:, 2]
+    lowest = max(cloud.SUPPORT_NOISE, 3 * noise_sd)
+    assert lowest - 1e-6 <= heights.min() < lowest + 0.003
+    assert ready.support_error == noise_sd

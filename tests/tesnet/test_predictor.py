@@ -231,6 +231,20 @@ def test_a_batch_has_the_answers_of_its_queries_one_by_one() -> None:
     assert predictor().predict_batch([]) == []
 
 
+def test_the_time_of_a_shared_pass_is_divided_by_prepared_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    queries = [tabletop_query(max_candidates=100), replace(tabletop_query(1), points=tabletop_query(1).points[::4])]
+    proposals = [predictor()._propose(query, None) for query in queries]
+    assert all(isinstance(one, predictor_module._Proposal) for one in proposals)
+    clock = iter(range(10))  # seconds
+    monkeypatch.setattr(predictor_module, "time", Mock(perf_counter=lambda: float(next(clock))))
+    with torch.inference_mode():
+        predictor()._encode(proposals)  # type: ignore[arg-type]
+    told = [one.clock.laps_ms["network"] for one in proposals]  # type: ignore[union-attr]
+    sizes = [len(one.prepared) for one in proposals]  # type: ignore[union-attr]
+    assert sizes[0] > 1.3 * sizes[1]
+    assert told == pytest.approx([1000 * size / sum(sizes) for size in sizes])
+
+
 # Repetition
 
 
@@ -468,3 +482,74 @@ def test_a_collision_check_can_be_left_in_its_middle(monkeypatch: pytest.MonkeyP
     assert ready is not None
     with pytest.raises(GaveUp):
         collision.blocked(ready, open_hands(torch.eye(4).expand(5000, 4, 4)), "free", between)
+
+
+# Further searches
+
+
+def noted_searches(predictor: GraspPredictor, monkeypatch: pytest.MonkeyPatch) -> list[Any]:
+    """What each search of the predictor finds from now on."""
+    found: list[Any] = []
+    search = predictor._search
+    monkeypatch.setattr(predictor, "_search", lambda *given: found.append(search(*given)) or found[-1])
+    return found
+
+
+@pytest.mark.parametrize("best", range(5))
+def test_the_search_with_the_best_score_is_answered_whichever_it_was(
+    monkeypatch: pytest.MonkeyPatch, best: int
+) -> None:
+    predictor = fresh_predictor()
+    found = noted_searches(predictor, monkeypatch)
+    told: list[torch.Tensor] = []
+    factors = [0.3, 0.5, 0.4, 0.6, 0.2]
+    factors[best] = 0.8
+
+    def scripted(features: Any, prepared: Any, searched: Any, clock: Any) -> torch.Tensor:
+        told.append(torch.linspace(0.5, 1.0, len(searched.free)) * factors[len(told)])
+        return told[-1]
+
+    monkeypatch.setattr(predictor, "_scores", scripted)
+    query = tabletop_query(max_candidates=60, max_grasps=1000, separation_translation=0.0)
+    result = predictor.predict(query)
+    assert len(told) == len(found) == 5
+    assert result.grasps.scores[0] == pytest.approx(0.8)
+    assert result.counts.candidates == found[best].count
+    assert set(np.float32(result.grasps.scores)) <= set(told[best].numpy())
+
+
+@pytest.mark.parametrize(
+    ("cone_deg", "most", "searches"),
+    [
+        (1.0, 6000, 1),  # fewer than half of what it may have: all approach points were tried
+        (180.0, 300, 5),
+        (180.0, 3000, 4),  # with the fourth it is 12,000, more than are scored in all
+    ],
+)
+def test_no_further_search_follows_one_of_few_candidates_or_many_scored_ones(
+    monkeypatch: pytest.MonkeyPatch, cone_deg: float, most: int, searches: int
+) -> None:
+    predictor = fresh_predictor()
+    found = noted_searches(predictor, monkeypatch)
+    monkeypatch.setattr(predictor, "_scores", lambda *given: torch.full((len(given[2].free),), 0.1))
+    predictor.predict(tabletop_query(approach=ApproachCone(-UP, cone_deg), max_candidates=most))
+    assert len(found[0].free) > 0
+    assert (2 * found[0].count < most) == (searches == 1)
+    assert len(found) == searches
+
+
+def test_a_query_that_is_kept_about_another_origin_has_the_same_answer() -> None:
+    """As far clouds are: what is given lies in the query's frame, what is answered in the caller's."""
+    origin = np.array([0.5, -0.25, 1.0])
+    query = tabletop_query(max_candidates=300)
+    kept = replace(
+        query,
+        points=(query.points - origin).astype(np.float32),
+        viewpoints=CAMERA - origin,
+        support_height=-float(UP @ origin),
+        origin=origin,
+    )
+    one, other = predictor().predict(query).grasps, predictor().predict(kept).grasps
+    assert len(one) > 0
+    for name in ("Ts_cloud_grasp", "approach_points", "contact_points", "scores", "widths"):
+        np.testing.assert_allclose(getattr(other, name), getattr(one, name), atol=1e-4)

@@ -124,3 +124,26 @@ def test_without_a_table_grasps_are_those_without_a_support_and_a_warning_says_s
     found, none = predictor.predict(auto(tabletop(0))), predictor.predict(auto(tabletop(0), support_height=None))
     np.testing.assert_array_equal(found.grasps.Ts_cloud_grasp, none.grasps.Ts_cloud_grasp)
     assert any("no plane across up was found" in note for note in found.warnings)
+
+
+@pytest.mark.parametrize("room", list(rooms.KINDS.values()), ids=list(rooms.KINDS))
+@pytest.mark.parametrize("up", ["auto", "given"])
+def test_a_query_that_is_kept_about_another_origin_finds_the_same_plane_and_tells_it_as_the_caller_has_it(
+    room: Callable[..., rooms.Room], up: str
+) -> None:
+    """That a camera stands at the origin, which speaks for what is up, is asked of the caller's frame."""
+    rng = np.random.default_rng(0)
+    frame = rooms.photograph(room(rng), (240, 180), 0.0, rng)
+    points = frame.intrinsics.back_project(frame.counts * rooms.DEPTH_SCALE)
+    origin = np.array([0.25, -0.5, 1.0])
+    asked: dict[str, Any] = {"support_height": "auto", "max_candidates": 300, "up": "auto" if up == "auto" else frame.truth.up}
+    plain = ask(points, viewpoints=np.zeros(3), **asked)
+    kept = ask((points - origin).astype(np.float32), viewpoints=-origin, origin=origin, **asked)
+    (_, one, notes), (query, other, notes_of_kept) = support.settled(plain), support.settled(kept)
+    assert one is not None
+    assert other is not None
+    np.testing.assert_allclose(other.up, one.up, atol=1e-3)
+    assert other.height + other.up @ origin == pytest.approx(one.height, abs=2e-3)
+    assert query.support_height == other.height
+    heights = [float(note.split(" m along up")[0].rpartition(" ")[2]) for (note,) in (notes, notes_of_kept)]
+    assert heights == pytest.approx([one.height, one.height], abs=2e-3)
