@@ -188,3 +188,17 @@ def test_the_predictor_answers_for_the_corrected_cloud_and_says_so() -> None:
     answer = predictor.predict(shown)
     np.testing.assert_array_equal(answer.grasps.Ts_cloud_grasp, expected.grasps.Ts_cloud_grasp)
     assert notes[0] in answer.warnings
+
+
+@pytest.mark.parametrize("scale", [0.92, 1.0, 1.09])
+def test_the_noise_that_is_told_is_that_of_the_corrected_points(scale: float) -> None:
+    plane = table(0.25, count=12_000)
+    wrong = seen_wrongly(
+        plane + np.random.default_rng(0).normal(0, [[0, 0, 0.002]], plane.shape), CAMERA, scale, np.eye(3)
+    )
+    found = correction(wrong, CAMERA, UP, 0.0)
+    assert isinstance(found, Correction)
+    heights = found.apply(wrong)[:, 2]
+    spread = 1.4826 * float(np.median(np.abs(heights - np.median(heights))))
+    assert spread == pytest.approx(0.002, rel=0.1)
+    assert found.noise_sd == pytest.approx(spread, rel=0.03)

@@ -308,3 +308,31 @@ def test_each_part_of_the_hand_that_is_asked_for_is_looked_for_in_the_shadow(
     assert alone.tolist() == [False]
     assert collision.in_shadow(cloud, hands.Ts_canonical_grasp, hand, hands.widths).tolist() == [True, False]
     assert collision.blocked(cloud, hands, "occupied").tolist() == [True, False]
+
+
+def test_what_is_not_sought_blocks_beside_what_is_and_frees_no_hand() -> None:
+    """Points outside the workspace are one more set of obstacles: a hand is free where it meets neither."""
+    query = tabletop_query(max_candidates=150)
+    ready = prepared(query)
+    found, _ = candidates.generate(ready, query, candidates.CandidateConfig())
+    others = ready.points + torch.tensor([0.03, 0.0, 0.02])
+    with_others = replace(ready, unsought=Obstacles.of(others))
+    alone, both = (collision.blocked(cloud, found, "free") for cloud in (ready, with_others))
+    met = collision.in_collision(others, found.Ts_canonical_grasp, PANDA, found.widths, SWEEP)
+    assert (met & ~alone).any()
+    assert (alone & ~met).any()
+    assert torch.equal(both, alone | met)
+
+
+@pytest.mark.parametrize("count", range(collision.HELD_POINTS - 1, collision.HELD_POINTS + 2))
+@pytest.mark.parametrize("deeper", [-0.0005, 0.0005])
+def test_a_hand_holds_things_from_so_many_points_so_deep_in_it_on(count: int, deeper: float) -> None:
+    """Counted in the palm of a hand at rest somewhere, from its front."""
+    pose = Pose.random(np.random.default_rng(3), reach=0.2)
+    along = np.linspace(-0.05, 0.05, count)
+    depth = collision.HELD_DEPTH + deeper
+    places = np.column_stack([np.zeros(count), along, np.full(count, PANDA.palm_front - depth)])
+    beside = np.column_stack([np.full(50, 0.2), np.linspace(-0.1, 0.1, 50), np.zeros(50)])
+    posted = torch.from_numpy(pose.apply(np.concatenate([places, beside]))).float()
+    hands = open_hands(torch.from_numpy(np.stack([pose.matrix, np.eye(4) + np.diag([0, 0, 5.0], 1)])).float())
+    assert collision.holds(posted, hands)[0] == (count >= collision.HELD_POINTS and deeper > 0)

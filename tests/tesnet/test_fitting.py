@@ -5,12 +5,12 @@ import pytest
 import torch
 
 from tesnet import fitting
-from tesnet.candidates import CandidateConfig, Candidates
+from tesnet.candidates import CandidateConfig, Candidates, generate, hand_clearance
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
 from tesnet.search import search
-from tests.tesnet.scenes import UP, Array, ask, prepared
+from tests.tesnet.scenes import UP, Array, ask, prepared, tabletop_query
 
 ABOVE = np.array([0.05, -0.1, 0.6])
 
@@ -118,3 +118,59 @@ def test_tips_that_swing_come_to_rest_where_those_of_a_parallel_hand_would(name:
     assert len(both) > 10
     apart = np.array([np.linalg.norm(bases["full"][pair] - bases["fitted"][pair]) for pair in both])
     assert np.mean(apart < 1e-5) > 0.9  # but where it would come too low midway between the walls
+
+
+@pytest.mark.parametrize("name", ["franka", "rg2", "wsg50"])
+def test_what_lies_between_the_fingers_is_what_each_pose_by_itself_has_there(name: str) -> None:
+    """Within half a finger's breadth and 3 mm of the middle plane, from the palm to the tips, past the near wall."""
+    hand = HANDS[name].gripper
+    query = tabletop_query(max_candidates=40, gripper=hand)
+    cloud = prepared(query)
+    found, _ = generate(cloud, query, CandidateConfig())
+    near = fitting._near_walls(cloud, found)
+    rows, y, n = (part.numpy() for part in fitting._between_fingers(cloud, found.Ts_canonical_grasp, near, hand))
+    points, normals = cloud.points.double().numpy(), cloud.normals.double().numpy()
+    seen = 0
+    for row, T in enumerate(found.Ts_canonical_grasp.double().numpy()):
+        local = (points - T[:3, 3]) @ T[:3, :3]
+        wall = local[int(found.contact[row]), 1]
+        margin = np.min(
+            [
+                hand.finger_breadth / 2 + 0.003 - np.abs(local[:, 0]),
+                hand.tip_offset - local[:, 2],
+                local[:, 2] - hand.palm_front,
+                wall + 0.002 - local[:, 1],
+                local[:, 1] - wall + hand.max_width,
+            ],
+            axis=0,
+        )
+        inside, certain = margin > 0, np.abs(margin) > 1e-6
+        seen += int(inside.sum())
+        expected, told = (np.sort(values) for values in (local[inside & certain, 1], y[rows == row]))
+        assert len(expected) <= len(told) <= len(expected) + int((~certain).sum())
+        if len(expected) == len(told):
+            np.testing.assert_allclose(told, expected, atol=1e-6)
+            along = np.sort((normals @ T[:3, 1])[inside & certain])
+            np.testing.assert_allclose(np.sort(n[rows == row]), along, atol=1e-5)
+        assert float(near[row]) == pytest.approx(wall, abs=1e-6)
+    assert seen > 900
+
+
+def test_a_hand_that_would_come_too_low_keeps_its_place_and_its_width() -> None:
+    """Any other is moved and told its width: each hand is wholly the one or wholly the other."""
+    query = tabletop_query(max_candidates=2000, gripper=(hand := HANDS["rg2"].gripper))
+    cloud = prepared(query)
+    found, _ = generate(cloud, query, CandidateConfig())
+    config = CandidateConfig(centred=True)
+    result = fitting.fitted(cloud, found, config, policy="fitted")
+    moved = fitting._moved(cloud, found, True, "fitted")
+    before, after = (
+        hand_clearance(cloud, some.Ts_canonical_grasp, hand, some.widths).double() for some in (found, moved)
+    )
+    stays = after < before.clamp(max=config.support_clearance) - 1e-5
+    assert 0 < int(stays.sum()) < len(found)
+    assert ((moved.widths - found.widths).abs()[stays] > 1e-4).any()
+    for name in ("Ts_canonical_grasp", "widths"):
+        told = getattr(result, name)
+        assert torch.equal(told[stays], getattr(found, name)[stays])
+        assert torch.equal(told[~stays], getattr(moved, name)[~stays])

@@ -136,7 +136,11 @@ def test_a_query_that_is_kept_about_another_origin_finds_the_same_plane_and_tell
     frame = rooms.photograph(room(rng), (240, 180), 0.0, rng)
     points = frame.intrinsics.back_project(frame.counts * rooms.DEPTH_SCALE)
     origin = np.array([0.25, -0.5, 1.0])
-    asked: dict[str, Any] = {"support_height": "auto", "max_candidates": 300, "up": "auto" if up == "auto" else frame.truth.up}
+    asked: dict[str, Any] = {
+        "support_height": "auto",
+        "max_candidates": 300,
+        "up": "auto" if up == "auto" else frame.truth.up,
+    }
     plain = ask(points, viewpoints=np.zeros(3), **asked)
     kept = ask((points - origin).astype(np.float32), viewpoints=-origin, origin=origin, **asked)
     (_, one, notes), (query, other, notes_of_kept) = support.settled(plain), support.settled(kept)

@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 import numpy as np
+import pytest
 import torch
 
 from tesnet.geometry import PANDA, Gripper
 from tesnet.swept import boxes_of, inside_hand
+from tests.tesnet.hand_twin import HANDS_TO_TRY, depth_in_hand
 
 BROAD = Gripper(max_width=0.06, palm_breadth=0.12, palm_front_breadth=0.08, palm_length=0.25)
 
@@ -30,6 +32,19 @@ def test_a_way_of_no_length_is_the_hand_at_rest() -> None:
     behind = inside_hand(x, y, z - 0.03, PANDA, 0.08, 0.05)
     assert bool((behind | ~rest).all())  # where the hand is, 3 cm behind it is on its way
     assert int(behind.sum()) > int(rest.sum())
+
+
+@pytest.mark.parametrize("depth", [0.0, 0.002, 0.004, 0.009])
+@pytest.mark.parametrize("name", HANDS_TO_TRY)
+def test_a_place_counts_as_deep_in_the_hand_where_the_twin_says_so(name: str, depth: float) -> None:
+    """Under every face of every part, the one behind included."""
+    hand = HANDS_TO_TRY[name]
+    for width in (0.0, hand.max_width):
+        places = np.random.default_rng(2).uniform(-0.16, 0.16, (200_000, 3))
+        deep = depth_in_hand(places, hand, width)
+        inside = inside_hand(*torch.from_numpy(places).unbind(dim=1), hand, width, 0.0, depth).numpy()
+        certain = np.abs(deep - depth) > 1e-9
+        np.testing.assert_array_equal(inside[certain], deep[certain] > depth)
 
 
 def test_half_the_width_belongs_to_each_side() -> None:

@@ -3,9 +3,11 @@ from __future__ import annotations
 from dataclasses import replace
 
 import numpy as np
+import pytest
 import torch
 
 from tesnet.networks import encode
+from tesnet.points import estimate_normals
 from tesnet.visibility import hidden, outside
 from tests.tesnet.scenes import fresh_network
 from tests.training.synthetic import labelled_view
@@ -93,6 +95,9 @@ def test_a_new_side_leaves_what_lies_within_it_and_the_candidates_of_that() -> N
         assert (cloud.points @ side[:3] <= side[3]).all()
         dropped = (VIEW.cloud.points @ side[:3] > side[3]).sum()
         assert len(cloud) + int(dropped) == len(VIEW.cloud)
+        kept = VIEW.cloud.points @ side[:3] <= side[3]
+        for name in ("points", "normals", "spectrum", "view_directions"):
+            assert torch.equal(getattr(cloud, name), getattr(VIEW.cloud, name)[kept])
         shares.append(int(dropped) / len(VIEW.cloud))
         exact = torch.cdist(cloud.points, cloud.points, compute_mode="donot_use_mm_for_euclid_dist")
         found_distances = exact.gather(1, cloud.neighbours)
@@ -131,6 +136,20 @@ def test_the_table_is_seen_about_the_things_and_not_behind_them() -> None:
     towards = torch.nn.functional.normalize(before.viewpoints[0] - table, dim=1)
     torch.testing.assert_close(after.view_directions[len(before) :], towards, atol=1e-5, rtol=0)
     assert ((after.normals[len(before) :] * towards).sum(dim=1) > 0).all()
+
+
+def test_the_tables_points_are_as_noisy_as_their_spectrum_tells() -> None:
+    """Which is that of the flattest of the things' own points: nothing shows a network what was added."""
+    before = VIEW.cloud
+    after = augmenting._with_table(before, np.random.default_rng(0))
+    table = torch.arange(len(before), len(after))
+    alone = table[(after.neighbours[table] >= len(before)).all(dim=1)]
+    _, fitted = estimate_normals(after.points, after.neighbours, 1.0)
+    told = after.spectrum[alone]
+    assert len(alone) > 300
+    torch.testing.assert_close(told[:, 0], before.spectrum[:, 0].quantile(0.25).expand(len(alone)))
+    assert 0.5 < float(fitted[alone, 0].median() / told[0, 0]) < 1.0  # a plane through 16 points follows some noise
+    assert float(fitted[alone, 1].median()) == pytest.approx(float(told[0, 1]), rel=0.3)
 
 
 def test_views_are_varied_now_and_then_and_keep_what_they_tell_of_their_candidates() -> None:

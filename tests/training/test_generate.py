@@ -18,6 +18,8 @@ from tesnet.cloud import PreparationConfig, prepare
 from tesnet.hands import HANDS
 from tesnet.predictor import GraspPredictor
 from tesnet.query import GraspQuery
+from tests.tesnet.scenes import fresh_network
+from tests.training.synthetic import labelled_view
 from training import generate as generating
 from training import viewing
 from training.generate import GenerateConfig, generate
@@ -136,7 +138,9 @@ def test_views_through_any_sensor_are_told_so_that_they_can_be_taken_again() -> 
     config = replace(CONFIG, camera="any", sensor="random", labels_per_view=2, views=3)
     sets, judge = generating.object_sets(config), generating.Judge.of(config)
     description, views = generating.label_scene(config, sets, 1, judge)
-    assert len(description["views"]) == len(views) > 0
+    assert len(description["views"]) == len(views) > 1
+    for name in ("seed", "cameras"):  # each view has its own
+        assert len({json.dumps(look[name]) for look in description["views"]}) == len(views)
     assert [look["sensor"] for look in description["views"]] == [view.sensor for view in views]
     models = {model.name: model for some in sets for model in some}
     with World() as world:
@@ -178,3 +182,44 @@ def test_tables_may_hold_more_things_of_other_weight_and_grip(tmp_path: Path) ->
     generate(varied, 1, 1, tmp_path, resume=True)
     with pytest.raises(LabelsError, match="other settings"):
         generate(replace(varied, things=8), 1, 1, tmp_path, resume=True)
+
+
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7])
+@pytest.mark.parametrize("colliding", [3, 40])
+@pytest.mark.parametrize("mines", [False, True])
+def test_the_candidates_that_are_tried_are_of_each_kind_as_many_as_asked_for(
+    share: float, colliding: int, mines: bool
+) -> None:
+    """A share that meets the cloud, fewer where there are fewer; of the others a half from those a network likes."""
+    view = labelled_view(0, count=100)
+    free = torch.from_numpy(np.random.default_rng(1).permutation(100) >= colliding)
+    config, network = replace(CONFIG, labels_per_view=30, colliding_share=share), fresh_network()
+    chosen = generating._choose(
+        view.cloud, view.candidates, free, config, np.random.default_rng(0), network if mines else None
+    )
+    assert len(set(chosen.tolist())) == len(chosen) == 30
+    assert (np.diff(chosen) > 0).all()
+    met = min(round(30 * share), colliding)
+    assert int((~free[chosen]).sum()) == met
+    with torch.inference_mode():
+        logits = network.score(networks.encode(network, view.cloud), view.cloud, view.candidates)
+    liked = set(sorted(free.nonzero()[:, 0].tolist(), key=lambda row: -logits[row])[: -(-int(free.sum()) // 4)])
+    if mines:
+        assert len(liked & set(chosen.tolist())) >= min(len(liked), (30 - met) // 2)
+    alike = replace(config, colliding_share=None)
+    draws = [
+        generating._choose(view.cloud, view.candidates, free, alike, np.random.default_rng(seed), None)
+        for seed in range(40)
+    ]
+    assert {len(draw) for draw in draws} == {30}
+    assert set(np.concatenate(draws).tolist()) == set(range(100))
+
+
+@pytest.mark.parametrize(("most", "expected"), [(None, range(1, 6)), (1, range(1, 2)), (9, range(1, 10))])
+def test_tables_hold_from_one_thing_to_as_many_as_they_may(most: int | None, expected: range) -> None:
+    config = replace(CONFIG, things=most)
+    counts = [generating._number_of_things(config, np.random.default_rng(seed)) for seed in range(600)]
+    assert set(counts) == set(expected)
+    shares = np.bincount(counts)[1:] / len(counts)
+    wanted = np.array([1, 1, 1, 1, 2]) / 6 if most is None else np.full(most, 1 / most)
+    np.testing.assert_allclose(shares, wanted, atol=0.06)
