@@ -40,6 +40,8 @@ NPZ, JSON = "application/x-npz", "application/json"
         (["text/html,application/xhtml+xml,application/xml;q=0.9,*/*;q=0.8"], JSON),
         (["text/html", NPZ], NPZ),
         ([f"{NPZ};q=often"], NPZ),
+        ([f"{NPZ};q=7, {JSON}"], JSON),  # no weight is more than 1
+        ([f"{NPZ};q=0.1, {JSON};q=-1"], NPZ),
         ([f"{JSON}; charset=utf-8"], JSON),
     ],
 )

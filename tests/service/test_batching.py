@@ -381,6 +381,41 @@ def test_a_much_cheaper_query_has_its_turn_in_the_middle_of_an_expensive_one(
     assert worker.expected_wait == pytest.approx(4)  # the time that another took in its middle was not learnt
 
 
+def test_the_time_that_cheap_ones_take_in_the_middle_is_waited_for_and_not_learnt(
+    timed: tuple[Timed, PredictionWorker],
+) -> None:
+    """However often: a median of the latest would hide it for a while."""
+    predictor, worker = timed
+    for _ in range(4):
+        expensive = worker.submit(cloud_of(4000))
+        assert predictor.entered.acquire(timeout=PATIENCE_S)
+        cheap = worker.submit(cloud_of(1000))
+        predictor.gate.release()
+        assert predictor.entered.acquire(timeout=PATIENCE_S)
+        assert worker.depth == 0
+        assert worker.expected_wait == pytest.approx(2 + 1)  # the other half, and the one in its middle
+        predictor.gate.release()
+        for job in (expensive, cheap):
+            job.future.result(PATIENCE_S)
+        assert worker.expected_wait == 0
+    worker.submit(cloud_of(4000))
+    assert worker.expected_wait == pytest.approx(4)
+    assert predictor.entered.acquire(timeout=PATIENCE_S)
+
+
+def test_a_large_body_is_not_read_where_only_spare_places_are_left(
+    worker: PredictionWorker, made: list[Echo], query: GraspQuery
+) -> None:
+    worker.submit(query)
+    assert made[0].entered.acquire(timeout=PATIENCE_S)
+    for _ in range(2):
+        worker.check_room(may_be_cheap=False)
+        worker.submit(query)
+    worker.check_room(may_be_cheap=True)
+    with pytest.raises(QueueFull, match="limit 2"):
+        worker.check_room(may_be_cheap=False)
+
+
 def test_what_nobody_waits_for_is_given_up(timed: tuple[Timed, PredictionWorker]) -> None:
     predictor, worker = timed
     forsaken = worker.submit(cloud_of(4000, seed=1))

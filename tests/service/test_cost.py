@@ -37,6 +37,27 @@ def test_whoever_asks_for_more_should_take_longer(more: dict[str, object]) -> No
     assert costs.measured(asked, now=0) is None
 
 
+VIEWS = {"viewpoints": np.ones((4, 3)), "up": np.array([0, 0, 1.0])}
+
+
+@pytest.mark.parametrize(
+    ("less", "more"),
+    [
+        ({}, {"points": np.zeros((2000, 3), np.float32)}),
+        ({}, {"num_approach_points": 64}),
+        ({}, {"max_candidates": 4000}),
+        ({}, {"viewpoints": np.ones((2, 3))}),
+        (VIEWS, VIEWS | {"unseen": "occupied"}),
+        (VIEWS, VIEWS | {"support_height": "auto"}),
+        (VIEWS, VIEWS | {"calibrate": True}),
+    ],
+)
+def test_each_thing_that_is_asked_for_costs_something_by_itself(
+    less: dict[str, object], more: dict[str, object]
+) -> None:
+    assert work(replace(PLAIN, **more)) > work(replace(PLAIN, **less))  # type: ignore[arg-type]
+
+
 @given(st.permutations([0.09, 0.1, 0.11, 0.1, 30.0]))
 def test_one_stall_lifts_no_guess(seconds: list[float]) -> None:
     costs = Costs()

@@ -117,3 +117,29 @@ def test_a_path_with_an_equals_sign_is_a_path() -> None:
 
 def test_the_networks_are_those_of_the_library() -> None:
     assert set(NETWORK_NAMES) == set(networks.NETWORKS)
+
+
+@pytest.mark.parametrize("queue_size", [1, 2, 7, 32])
+@pytest.mark.parametrize("client_places", [None, 3])
+@pytest.mark.parametrize(
+    ("told_apart_by", "are_known"),
+    [
+        ({}, False),
+        ({"GRASP_API_KEYS": "one"}, False),  # everybody's
+        ({"GRASP_API_KEYS": "one,other"}, True),
+        ({"GRASP_TRUSTED_PROXIES": "10.0.0.0/8"}, True),
+        ({"GRASP_API_KEYS": "one", "GRASP_TRUSTED_PROXIES": "10.0.0.1"}, True),
+    ],
+)
+def test_a_client_that_is_known_has_half_of_the_places_unless_told(
+    queue_size: int, client_places: int | None, told_apart_by: dict[str, str], are_known: bool
+) -> None:
+    given = {"GRASP_QUEUE_SIZE": str(queue_size), **told_apart_by}
+    given |= {} if client_places is None else {"GRASP_CLIENT_PLACES": str(client_places)}
+    expected = client_places or max(1, queue_size // 2)
+    assert load_settings(given).places_of_a_client == (expected if are_known else None)
+
+
+def test_mebibytes_are_told_in_bytes() -> None:
+    settings = load_settings({"GRASP_MAX_BODY_MB": "1.5", "GRASP_MAX_HELD_MB": "3"})
+    assert (settings.max_body_bytes, settings.max_held_bytes) == (3 * 2**19, 3 * 2**20)

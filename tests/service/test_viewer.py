@@ -56,6 +56,16 @@ def test_points_are_those_of_the_body(http: httpx.Client, cloud: NDArray[np.floa
     np.testing.assert_array_equal(np.frombuffer(answer.content, "<f4").reshape(-1, 3), cloud)
 
 
+def test_points_of_a_far_cloud_lie_where_the_caller_has_them(http: httpx.Client, cloud: NDArray[np.float32]) -> None:
+    far = cloud + np.array([5_400_000.0, -300.0, 70.0])
+    file = BytesIO()
+    np.save(file, far)
+    answer = http.post(f"{ADDRESS}/points", content=file.getvalue(), headers={"Content-Type": "application/x-npy"})
+    points = np.frombuffer(answer.content, "<f4").reshape(-1, 3)
+    np.testing.assert_allclose(points, far, atol=0.5)  # as float32 has such numbers
+    np.testing.assert_allclose(points[:, 2], far[:, 2], atol=1e-5)
+
+
 def test_points_of_a_depth_image_are_back_projected(http: httpx.Client) -> None:
     view = box_on_table()
     file = BytesIO()

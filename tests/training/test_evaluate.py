@@ -47,6 +47,30 @@ def test_the_calibration_is_fitted_to_every_other_view_and_judged_on_the_rest() 
     check_judged(given, logits, success, (2.0, -0.7))
 
 
+def test_the_best_candidate_of_each_view_is_looked_at_by_itself() -> None:
+    """And views too poor for the paper's metric count for all others."""
+    rng = np.random.default_rng(1)
+    scored = [(rng.normal(size=60), np.zeros(60, dtype=bool)) for _ in range(5)]
+    for view, ((logits, success), best_succeeds) in enumerate(
+        zip(scored, (True, False, True, True, False), strict=True)
+    ):
+        order = logits.argsort()
+        success[order[: 12 if view else 3]] = True
+        success[order[-1]] = best_succeeds
+    found = measure(scored, seed=0)
+    assert found["top1"] == pytest.approx(3 / 5)
+    assert (found["views"], found["usable_views"], found["candidates"]) == (5, 4, 300)
+    assert found["successes"] == sum(int(success.sum()) for _, success in scored)
+    logits, success = (np.concatenate([view[part] for view in scored]) for part in (0, 1))
+    for name, judge in (
+        ("auroc", metrics.auroc),
+        ("average_precision", metrics.average_precision),
+        ("balanced_accuracy", metrics.balanced_accuracy),
+    ):
+        assert found[name] == pytest.approx(judge(logits, success))
+    assert (found["accuracy"], found["balanced_loss"]) == metrics.edge_metric(scored[1:], 0)
+
+
 def check_judged(
     found: dict[str, Any], logits: metrics.Logits, success: metrics.Success, calibration: tuple[float, float]
 ) -> None:

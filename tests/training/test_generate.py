@@ -11,7 +11,7 @@ import torch
 
 from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
-from simharness.sim.scene import restore_scene
+from simharness.sim.scene import SCALE_RANGES, restore_scene, scales_for
 from simharness.sim.world import World
 from tesnet import networks, weights
 from tesnet.cloud import PreparationConfig, prepare
@@ -223,3 +223,19 @@ def test_tables_hold_from_one_thing_to_as_many_as_they_may(most: int | None, exp
     shares = np.bincount(counts)[1:] / len(counts)
     wanted = np.array([1, 1, 1, 1, 2]) / 6 if most is None else np.full(most, 1 / most)
     np.testing.assert_allclose(shares, wanted, atol=0.06)
+
+
+@pytest.mark.parametrize("name", ["franka", "rg2", "robotiq_2f140"])
+@pytest.mark.parametrize("scale", [None, (0.4, 0.5)])
+def test_things_are_as_large_as_the_hand_that_is_to_take_them(name: str, scale: tuple[float, float] | None) -> None:
+    config = replace(CONFIG, gripper=name, scale=scale, views=0, things=5)
+    low, high = scales_for("packed", HANDS[name].gripper, scale)
+    assert (low, high) != scales_for("packed", HANDS["hand_e"].gripper, scale)
+    sets, judge = generating.object_sets(config), generating.Judge.of(config)
+    things = [item for number in range(3) for item in generating.label_scene(config, sets, number, judge)[0]["objects"]]
+    sized = {model.name for some in sets for model in some if model.sized}
+    middle = sum(SCALE_RANGES["packed"]) / 2
+    hints = {model.name: model.scale_hint for some in sets for model in some}
+    drawn = [item["scale"] / hints[item["name"]] * (middle if item["name"] in sized else 1.0) for item in things]
+    assert len(drawn) >= 3
+    assert low - 1e-9 <= min(drawn) < max(drawn) <= high + 1e-9

@@ -44,3 +44,23 @@ def test_known_hands_come_by_their_names_and_draw_nothing() -> None:
     assert drawn_hand("rg2", rng) is HANDS["rg2"]
     assert rng.bit_generator.state == before
     assert drawn_hand("random", rng) != drawn_hand("random", rng)
+
+
+def test_sizes_of_a_drawn_hand_go_together() -> None:
+    """A body is 20 to 125 mm longer than the opening; of hands that open 60 mm and more, 0.4 swing."""
+    hands = [random_hand(np.random.default_rng(seed)).gripper for seed in range(400)]
+    for hand in hands:
+        assert 0.02 - 1e-9 <= hand.palm_length - hand.max_width <= 0.125 + 1e-9
+        assert hand.hand_to_tcp == pytest.approx(hand.palm_depth + hand.finger_depth - hand.tip_offset)
+        assert 0.15 - 1e-9 <= hand.tip_offset / hand.finger_depth <= 0.45 + 1e-9
+        assert hand.finger_tip_thickness <= max(0.005, hand.finger_thickness)
+        assert 0.5 - 1e-9 <= hand.finger_tip_breadth / hand.finger_breadth <= 1 + 1e-9
+        assert hand.finger_taper < hand.finger_depth
+        assert 0.4 - 1e-9 <= hand.palm_front_breadth / hand.palm_breadth <= 1 + 1e-9
+        assert hand.palm_taper <= 0.7 * hand.palm_depth + 1e-9
+        if hand.linkage_length is not None:
+            assert 0.53 - 1e-9 <= hand.linkage_length / hand.max_width <= 0.78 + 1e-9
+            assert -0.001 <= hand.linkage_offset <= 0.009
+    wide = [hand for hand in hands if hand.max_width >= 0.06]
+    assert all(hand.linkage_length is None for hand in hands if hand.max_width < 0.06)
+    assert 0.33 < np.mean([hand.linkage_length is not None for hand in wide]) < 0.47

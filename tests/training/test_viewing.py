@@ -1,14 +1,18 @@
 from __future__ import annotations
 
 import json
+from collections.abc import Iterator
 
 import numpy as np
 import pytest
 
-from simharness.sim.camera import PRESETS, sample_camera
-from simharness.sim.scene import WORKSPACE
+from simharness.sim.camera import PRESETS, perception_box, sample_camera
+from simharness.sim.objects import ObjectModel
+from simharness.sim.scene import TABLE_HEIGHT, WORKSPACE, restore_scene
 from simharness.sim.sensors.catalogue import SENSORS
-from training.viewing import SHOWS, Viewing, draw_viewing, sensor_of
+from simharness.sim.world import World, data_path
+from tesnet.hands import HANDS
+from training.viewing import SHOWS, Shows, Viewing, draw_viewing, sensor_of
 
 pytestmark = pytest.mark.sim
 MIDDLE = np.array([0.15, 0.15, 0.05])
@@ -71,3 +75,46 @@ def test_a_seed_draws_one_sensor() -> None:
     assert sensor_of("d435", np.random.default_rng(0)) is SENSORS["d435"]
     one, same, other = (sensor_of("random", np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert one == same != other
+
+
+@pytest.fixture
+def world() -> Iterator[World]:
+    """A table with one cube of 5 cm in its middle."""
+    item = {
+        "name": "cube",
+        "scale": 1.0,
+        "position": [0.15, 0.15, TABLE_HEIGHT + 0.025],
+        "quaternion_xyzw": [0, 0, 0, 1],
+    }
+    cube = ObjectModel("cube", data_path() / "cube_small.urdf")
+    with World() as world:
+        restore_scene(world, {"kind": "packed", "objects": [item]}, {"cube": cube})
+        yield world
+
+
+@pytest.mark.parametrize("shows", SHOWS)
+def test_what_is_shown_decides_whether_the_table_is_seen_calibrated_by_and_bounded(world: World, shows: Shows) -> None:
+    """Through a camera whose depth is wrong: by the table, where that is seen, the cloud comes back to its height."""
+    viewing = Viewing(sample_camera("random", np.random.default_rng(1)), "d435-uncalibrated", 5, shows)
+    observation = viewing.observe(world)
+    query = viewing.query(observation, 3, HANDS["rg2"].gripper)
+    assert (query.seed, query.gripper) == (3, HANDS["rg2"].gripper)
+    assert query.support_height == observation.table_height
+    assert (query.workspace is None) == (shows == "open")
+    if query.workspace is not None:
+        expected = perception_box(observation.table_height)
+        np.testing.assert_allclose(
+            [query.workspace.minimum, query.workspace.maximum], [expected.minimum, expected.maximum]
+        )
+    beside = np.abs(query.points[:, :2] - 0.15).max(axis=1) > 0.2
+    if shows == "box":
+        assert not beside.any()
+        np.testing.assert_array_equal(query.points, observation.points_world)
+        return
+    assert beside.sum() > 1000
+    before, after = (
+        abs(float(np.median(points[beside, 2])) - observation.table_height)
+        for points in (observation.points_world, query.points)
+    )
+    assert after < 0.0005
+    assert before > 4 * after
