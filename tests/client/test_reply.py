@@ -5,6 +5,7 @@ import operator
 import pickle
 import time
 from collections.abc import Callable
+from dataclasses import asdict, replace
 from datetime import datetime, timedelta, timezone
 from email.utils import format_datetime
 from typing import TYPE_CHECKING, Any, cast
@@ -14,7 +15,9 @@ import pytest
 
 import client
 from client.reply import Answer, grasp_reply, model_reply, problem
+from tesnet.geometry import Pose
 from tesnet.hands import HANDS
+from tests.client.conftest import model_document
 
 if TYPE_CHECKING:
     from tests.client.conftest import Answering
@@ -61,6 +64,41 @@ def test_every_field_of_the_document_arrives(found: dict[str, Any]) -> None:
     assert (reply.model.name, reply.model.weights_sha256) == ("tesnet", "ab" * 32)
     assert reply.request_id == "r-1"
     assert reply.to_dict() == found
+
+
+def test_no_number_of_the_document_is_taken_for_another(found: dict[str, Any]) -> None:
+    """All of them differ here, hand and pregrasp turned as no service turns them."""
+    rng = np.random.default_rng(0)
+    for wire in found["grasps"]:
+        for name in ("hand_pose", "pregrasp"):
+            pose = Pose.random(rng, reach=0.3)
+            wire[name] = {"position": pose.translation.tolist(), "quaternion_xyzw": pose.quaternion_xyzw.tolist()}
+        wire["width"] = float(rng.uniform(0, 0.08))
+    numbers = iter(range(1, 100))
+    for group in (found["counts"], found["counts"]["rejected"], found["timings_ms"]):
+        group.update({name: next(numbers) for name, value in group.items() if not isinstance(value, dict)})
+    reply = grasp_reply(_answer(found))
+    for grasp, wire in zip(reply.grasps, found["grasps"], strict=True):
+        for name in ("hand_pose", "pregrasp"):
+            pose, told = getattr(grasp, name), wire[name]
+            np.testing.assert_allclose(pose.translation, told["position"], atol=1e-12)
+            np.testing.assert_allclose(abs(pose.quaternion_xyzw @ told["quaternion_xyzw"]), 1)
+        assert grasp.width == wire["width"]
+    counts = asdict(replace(reply.counts, rejected=dict(reply.counts.rejected)))
+    assert counts == found["counts"]
+    assert dict(reply.timings_ms) == found["timings_ms"]
+
+
+def test_the_limits_of_a_service_arrive_each_in_its_place() -> None:
+    document = model_document()
+    document["limits"] = {name: 10 + place for place, name in enumerate(document["limits"])}
+    document["models"] += [{**document["models"][0], "name": "gpd", "version": "7", "weights_sha256": None}]
+    reply = model_reply(_answer(document))
+    assert asdict(reply.limits) == document["limits"]
+    assert [(model.name, model.version, model.weights_sha256) for model in reply.models] == [
+        ("tesnet", "1", "ab" * 32), ("gpd", "7", None),
+    ]  # fmt: skip
+    assert (reply.device, list(reply.frame_conventions)) == ("cpu", document["frame_conventions"])
 
 
 def test_nothing_found_is_a_reply_with_a_reason_and_empty_stacks(nothing_found: dict[str, Any]) -> None:

@@ -110,6 +110,18 @@ def test_what_belongs_to_each_point_travels_in_a_form() -> None:
     assert payload.normals.tolist() == np.eye(4, 3).tolist()
 
 
+def test_what_belongs_to_each_pixel_of_an_image_of_points_travels_row_by_row() -> None:
+    rng = np.random.default_rng(0)
+    points, normals = rng.uniform(0.1, 1, (2, 3, 4, 3)).astype(np.float32)
+    index = np.arange(12).reshape(3, 4)
+    payload, _ = as_sent(points_request(points, {}, view_index=index, normals=normals))
+    assert payload.view_index is not None
+    assert payload.normals is not None
+    np.testing.assert_array_equal(payload.points, points.reshape(-1, 3))
+    assert payload.view_index.tolist() == list(range(12))
+    np.testing.assert_array_equal(payload.normals, normals.reshape(-1, 3))
+
+
 @pytest.mark.parametrize(
     ("beside", "name"),
     [

@@ -3,6 +3,7 @@
 from __future__ import annotations
 
 import json
+import math
 from collections.abc import Iterator
 from typing import Any
 
@@ -13,6 +14,7 @@ import tritonclient.http as triton
 from numpy.typing import NDArray
 from tritonclient.utils import InferenceServerException
 
+from service.inference_protocol.decoding import decode
 from service.inference_protocol.tensors import HEADER_LENGTH, OUTPUTS
 from tests.conftest import PATIENCE_S
 
@@ -220,6 +222,28 @@ def test_null_is_as_good_as_left_out(http: httpx.Client) -> None:
 def test_options_in_the_query_string_are_refused(http: httpx.Client) -> None:
     answer = http.post(f"{INFER}?max_grasps=1", json=body())
     assert (answer.status_code, "parameters" in answer.json()["error"]) == (422, True)
+
+
+@pytest.mark.parametrize(
+    ("microseconds", "seconds"),
+    [(None, math.inf), (0, math.inf), (1, 1e-6), (2_500_000, 2.5), (10**12 - 1, 999_999.999999)],
+)
+def test_a_timeout_is_told_in_microseconds_and_zero_is_none(microseconds: int | None, seconds: float) -> None:
+    asked = decode(bytearray(json.dumps(body(parameters={"timeout": microseconds})).encode()), None, 1000)
+    assert asked.timeout == pytest.approx(seconds)
+
+
+@pytest.mark.parametrize("of_all", [None, True, False])
+@pytest.mark.parametrize("of_one", [None, True, False])
+def test_whether_an_output_is_binary_is_its_own_word_before_that_for_all(
+    of_all: bool | None, of_one: bool | None
+) -> None:
+    parameters = {} if of_one is None else {"parameters": {"binary_data": of_one}}
+    request = body(
+        outputs=[{"name": "scores", **parameters}, {"name": "widths"}], parameters={"binary_data_output": of_all}
+    )
+    asked = decode(bytearray(json.dumps(request).encode()), None, 1000)
+    assert asked.outputs == {"scores": bool(of_all if of_one is None else of_one), "widths": bool(of_all)}
 
 
 def test_tritons_timeout_is_how_long_a_request_may_wait(client: triton.InferenceServerClient, cloud: Cloud) -> None:

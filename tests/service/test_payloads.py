@@ -401,3 +401,32 @@ def test_a_normal_that_is_not_finite_is_none(missing: float, of_image: bool) -> 
     np.testing.assert_array_equal(found, expected)
     query = build_query(cloud_payload(np.zeros((6, 3), np.float32), {}, {"normals": found}), parse_options({}))
     np.testing.assert_array_equal(query.normals, expected)
+
+
+@given(st.data())
+@settings(max_examples=60, deadline=None)
+def test_the_points_that_count_against_the_limit_are_those_in_the_workspace_and_on_the_mask(
+    data: st.DataObject,
+) -> None:
+    """A target without a mask lets no more of them through: its points are looked at among all others."""
+    count, limit = data.draw(st.integers(1, 20)), data.draw(st.integers(1, 12))
+    points = np.random.default_rng(data.draw(st.integers(0, 99))).uniform(0, 1, (count, 3)).astype(np.float32)
+    low, high = [0.1, 0.0, 0.0], [0.8, 0.9, 1.0]
+    bounded, kind = data.draw(st.booleans()), data.draw(st.sampled_from(["none", "mask", "label", "indices", "box"]))
+    labels = np.arange(count) % 3
+    target = {
+        "label": {"label": 2},
+        "indices": {"indices": [0]},
+        "box": {"box": {"min": [0, 0, 0], "max": [0.1, 0.1, 0.1]}},
+    }
+    raw = {"workspace": json.dumps({"min": low, "max": high}).encode()} if bounded else {}
+    raw |= {"target": json.dumps(target[kind]).encode()} if kind in target else {}
+    payload = Payload(points, options=raw, mask=labels if kind in ("mask", "label") else None)
+    matter = sum(
+        (not bounded or all(a <= x <= b for a, x, b in zip(low, point, high, strict=True)))
+        and (kind != "mask" or label != 0)
+        and (kind != "label" or label == 2)
+        for point, label in zip(points.tolist(), labels.tolist(), strict=True)
+    )
+    with contextlib.nullcontext() if matter <= limit else pytest.raises(TooManyPoints, match=f"{matter}.*{limit}"):
+        build_query(payload, parse_options(raw), limit)

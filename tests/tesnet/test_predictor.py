@@ -18,7 +18,7 @@ from tesnet import predictor as predictor_module
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box
 from tesnet.predictor import GraspPredictor, configuration_of
-from tesnet.query import ApproachCone, GraspQuery
+from tesnet.query import MAX_SEED, ApproachCone, GraspQuery
 from tesnet.result import REJECTIONS, GraspResult
 from tests.tesnet.scenes import (
     CAMERA,
@@ -553,3 +553,17 @@ def test_a_query_that_is_kept_about_another_origin_has_the_same_answer() -> None
     assert len(one) > 0
     for name in ("Ts_cloud_grasp", "approach_points", "contact_points", "scores", "widths"):
         np.testing.assert_allclose(getattr(other, name), getattr(one, name), atol=1e-4)
+
+
+def test_queries_whose_seeds_follow_each_other_share_no_search() -> None:
+    asked = tabletop_query()
+    for first in (0, 1000, MAX_SEED - 20):
+        queries = [asked.but(seed=first + step) for step in range(20)]
+        further = [
+            predictor_module._further(query, number)
+            for query in queries
+            for number in range(1, predictor_module.FURTHER_SEARCHES + 1)
+        ]
+        seeds = [query.seed for query in (*queries, *further)]
+        assert len(set(seeds)) == len(seeds)
+        assert {query.num_approach_points for query in further} == {4 * 32}

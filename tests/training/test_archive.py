@@ -13,8 +13,11 @@ from simharness.sim.protocol import query_about
 from tesnet import weights
 from tesnet.cloud import PreparationConfig, prepare
 from tesnet.collision import blocked
+from tesnet.geometry import Pose
 from tesnet.predictor import GraspPredictor
 from tesnet.query import GraspQuery
+from tests.tesnet.scenes import CAMERA, UP
+from tests.training.synthetic import labelled_view
 from training import archive, viewing
 from training.__main__ import main
 from training.archive import _draw, pack, unpack
@@ -190,3 +193,20 @@ def test_an_archive_without_its_objects_is_refused(
     assert "name its objects with --objects" in capsys.readouterr().err
     with pytest.raises(LabelsError, match="holds no labels_"):
         unpack(labels, "procedural-train", tmp_path / "again")
+
+
+@pytest.mark.parametrize("others", [0, 2])
+def test_views_of_old_scenes_were_taken_from_the_recorded_cameras_where_their_viewpoints_are(others: int) -> None:
+    """Scenes of before 0.6.0 record cameras of views that were dropped, too; a fused view begins with its first one."""
+    places = CAMERA + np.array([[0.3, 0, 0], [0, 0, 0], [0, -0.2, 0], [0.1, 0.2, 0]])
+    cameras = [
+        [Pose.look_at(places[(first + step) % 4], [0, 0, 0], UP).matrix.tolist() for step in range(1 + others)]
+        for first in range(4)
+    ]
+    views = []
+    for first in (1, 3):
+        view = labelled_view(count=30)
+        T_canonical_world = view.cloud.T_cloud_canonical.inverse()
+        stood = [T_canonical_world.apply(places[(first + step) % 4]) for step in range(1 + others)]
+        views.append(replace(view, cloud=replace(view.cloud, viewpoints=torch.tensor(np.array(stood)).float())))
+    assert archive._cameras_of({"cameras": cameras}, views) == [cameras[1], cameras[3]]

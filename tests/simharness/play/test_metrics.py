@@ -9,6 +9,7 @@ from hypothesis import strategies as st
 from scipy.stats import binomtest
 
 from simharness.play.metrics import Percentiles, Rate, summarise, wilson_interval
+from simharness.play.records import Latency
 
 Counts = st.integers(1, 2000).flatmap(lambda total: st.tuples(st.integers(0, total), st.just(total)))
 
@@ -77,3 +78,12 @@ def test_latencies_are_of_the_requests_that_were_made(make_round: Any) -> None:
     assert (summary.service_ms.median, summary.service_ms.p95) == pytest.approx((11.0, 11.9))
     assert (summary.round_trip_ms.median, summary.round_trip_ms.p95) == pytest.approx((13.0, 13.9))
     assert summarise([]).service_ms == Percentiles(None, None)
+
+
+def test_requests_that_found_nothing_took_their_time_too(make_round: Any) -> None:
+    record = make_round(0, 0, ["success"], ("no_candidates", "no_candidates"))
+    slow = tuple(
+        dataclasses.replace(entry, latency=Latency(service=90.0, round_trip=95.0)) for entry in record.no_grasps
+    )
+    summary = summarise([dataclasses.replace(record, no_grasps=slow)])
+    assert (summary.service_ms.median, summary.round_trip_ms.median) == (90.0, 95.0)

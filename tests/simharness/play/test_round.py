@@ -136,3 +136,17 @@ def test_failures_end_a_round_only_in_a_row(objects: tuple[ObjectModel, ...], ma
     in_a_row = [not (first or second) for first, second in pairwise(outcomes)]
     assert not any(in_a_row[:-1])
     assert in_a_row[-1] == (record.ended == "two_failures")
+
+
+def test_what_replaces_the_cameras_noise_leaves_the_rest_of_its_sensor(make_settings: Any) -> None:
+    """A zero is no noise, not a setting that was left out."""
+    assert camera_sensor(make_settings(noise_std=0.0)).point_sigma == 0
+    assert camera_sensor(make_settings(sensor="d435", depth_noise_std=0.0)).depth == SENSORS["d435"].depth
+    assert (
+        camera_sensor(make_settings(sensor="d435", dex_noise=True)).depth
+        == SENSORS["dex"].depth + SENSORS["d435"].depth
+    )
+    assert camera_sensor(make_settings(sensor="dex", dex_noise=False)).depth == ()
+    assert camera_sensor(make_settings(sensor="dex", dex_noise=True)) == SENSORS["dex"]
+    both = camera_sensor(make_settings(sensor="d435", depth_noise_std=0.001, noise_std=0.002))
+    assert (set(both.depth), both.point_sigma) == ({*SENSORS["d435"].depth, DepthGaussian(0.001)}, 0.002)

@@ -12,13 +12,13 @@ import pytest
 
 from simharness.__main__ import main
 from simharness.play.folder import RunFolder
-from simharness.play.records import ModelRecord, Serving
+from simharness.play.records import ModelRecord, RoundRecord, Serving
 from simharness.play.round import Attempted, Observed, Plan, play_round
 from simharness.report.causes import examine, failures, failures_report, failures_table, place_of
 from simharness.sim.camera import Observation, observe_from
 from simharness.sim.execute import Grip, Outcome
 from simharness.sim.hand import HandContact
-from simharness.sim.objects import load_object_set
+from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.scene import TABLE_HEIGHT, restore_scene
 from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
@@ -113,3 +113,22 @@ def test_recorded_failures_are_played_again_and_sorted(
     (first,) = failures(settings, objects, folder.read_rounds(), 1)
     assert (first.line, first.outcome, first.approach_deg) == (0, "slip", 0.0)
     assert failures_report([first, first], 4, 3)["causes"][0]["count"] == 2
+
+
+def test_the_earliest_failures_are_told_with_their_lines_whatever_succeeded_between(
+    played: RoundRecord, objects: tuple[ObjectModel, ...], make_settings: Any
+) -> None:
+    settings = make_settings(executor="edge")
+    missed = [play_round(settings, objects, Misses(), 0, number) for number in (2, 3)]
+    rounds = [played, *missed]
+    attempts = [attempt for record in rounds for attempt in record.attempts]
+    lines = [line for line, attempt in enumerate(attempts) if not attempt.success]
+    assert 4 <= len(lines) < len(attempts)
+    few, all_of_them = (list(failures(settings, objects, rounds, limit)) for limit in (3, 99))
+    assert [failure.line for failure in few] == lines[:3]
+    assert [failure.line for failure in all_of_them] == lines
+    for failure in all_of_them:
+        recorded = attempts[failure.line]
+        told = (failure.seed, failure.round, failure.attempt, failure.outcome, failure.score)
+        assert told == (recorded.seed, recorded.round, recorded.attempt, recorded.outcome, recorded.score)
+        assert failure.height == pytest.approx(recorded.T_world_grasp[2, 3] - TABLE_HEIGHT)

@@ -112,6 +112,8 @@ def test_rounds_of_one_run_alone_are_left_out_and_counted(played: Any) -> None:
     result = compare(played([(3, 4), (5, 5), (0, 2)]), played([(3, 4), (4, 5)]))
     assert (result.first.rounds, result.second.rounds, result.left_out) == (2, 2, 1)
     assert result.gsr.value == pytest.approx(1 / 9)
+    turned = compare(played([(3, 4), (4, 5)]), played([(3, 4), (5, 5), (0, 2)]))
+    assert (turned.first.rounds, turned.left_out) == (2, 1)
 
 
 def test_nothing_to_count_is_no_difference_of_zero(played: Any) -> None:

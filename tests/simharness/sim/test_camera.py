@@ -216,3 +216,19 @@ def test_with_the_table_in_view_the_cloud_holds_it_and_all_that_was_shown_withou
     assert (np.abs(whole[:, 2] - TABLE_HEIGHT) < 1e-5).sum() > 10_000
     inside = ((whole >= PERCEPTION_BOX.minimum) & (whole <= PERCEPTION_BOX.maximum)).all(axis=1)
     np.testing.assert_array_equal(whole[inside], alone)
+
+
+@pytest.mark.parametrize("seed", range(4))
+@pytest.mark.parametrize("error", [0.0, 0.015])
+def test_the_cloud_is_cropped_where_the_table_is_believed_to_be(world: World, error: float, seed: int) -> None:
+    sensor = Sensor(calibration=Calibration(table_height=error, exact=True))
+    seen = observe(world, "random", np.random.default_rng(seed), sensor)
+    assert abs(seen.table_height - TABLE_HEIGHT) == pytest.approx(error)
+    lowest = float(PERCEPTION_BOX.minimum[2]) + seen.table_height - TABLE_HEIGHT
+    shown = perception_box(seen.table_height)
+    assert shown.minimum[2] == pytest.approx(lowest)
+    np.testing.assert_allclose(
+        [*shown.minimum[:2], *shown.maximum], [*PERCEPTION_BOX.minimum[:2], *PERCEPTION_BOX.maximum]
+    )
+    # Of the box's walls, or where the crop reaches into the table, of that.
+    assert float(seen.points_world[:, 2].min()) == pytest.approx(max(lowest, TABLE_HEIGHT), abs=0.002)

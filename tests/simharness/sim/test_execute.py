@@ -8,6 +8,7 @@ import numpy as np
 import pytest
 from numpy.typing import NDArray
 
+from simharness.sim import execute
 from simharness.sim.execute import (
     RETREAT_DISTANCE,
     Executor,
@@ -22,7 +23,7 @@ from simharness.sim.hand import Hand, Placement
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import TABLE_HEIGHT, restore_scene, settle
 from simharness.sim.world import BASE_LINK, World, data_path
-from tesnet.geometry import PANDA
+from tesnet.geometry import PANDA, Pose
 from tesnet.hands import HANDS, KnownHand
 
 pytestmark = pytest.mark.sim
@@ -290,3 +291,39 @@ def test_fingers_hold_nothing_when_they_all_but_meet(thickness: float, empty: bo
         outcome = attempt(world, hand, from_above(z=TABLE_HEIGHT + 0.04), PANDA.max_width, "strict")
         assert outcome.closed is not None
         assert outcome.closed.empty is empty
+
+
+BESIDE_A_FINGER, UNDER_THE_CUBE = (0.15, 0.15 + SIDE / 2 + 0.024, 0.4), (0.15, 0.15, 0.4 - SIDE / 2 - 0.0095)
+
+
+@pytest.mark.parametrize(
+    ("blocks", "hangs"), [([], True), ([BESIDE_A_FINGER], False), ([UNDER_THE_CUBE], False), ([(0.3, 0.3, 0.4)], True)]
+)
+def test_a_thing_hangs_where_it_alone_is_touched_and_touches_the_hand_alone(
+    blocks: list[tuple[float, float, float]], hangs: bool
+) -> None:
+    """Only then does nothing change any more, and the rest of a retreat need not be waited for."""
+    with World() as world:
+        hand, (cube,) = scene(world, MIDDLE)
+        world.set_pose(cube, (*MIDDLE, 0.4), (0.0, 0.0, 0.0, 1.0))
+        for place in blocks:
+            world.add_static_box((0.01, 0.01, 0.01), place, colour=(1.0, 1.0, 1.0, 1.0))
+        hand.place(from_above(z=0.4), SIDE)
+        world.find_contacts()
+        found = execute._hanging(world, hand)
+        assert list(found) == ([cube] if hangs else [])
+        for pose in found.values():
+            np.testing.assert_allclose(pose.translation, 0.0, atol=1e-6)
+
+
+@pytest.mark.parametrize("moved", [0.0, 0.00015, 0.00025])
+@pytest.mark.parametrize("turned_deg", [0.0, 0.25, 0.35])
+def test_a_thing_is_still_where_it_neither_moves_nor_turns(moved: float, turned_deg: float) -> None:
+    rng = np.random.default_rng(0)
+    for _ in range(20):
+        before, axis, direction = Pose.random(rng, reach=0.1), rng.normal(size=3), rng.normal(size=3)
+        half = np.deg2rad(turned_deg) / 2
+        turn = Pose.from_quaternion([*np.sin(half) * axis / np.linalg.norm(axis), np.cos(half)], np.zeros(3))
+        shift = moved * direction / np.linalg.norm(direction)
+        now = Pose(turn.rotation @ before.rotation, before.translation + shift)
+        assert execute._still(before, now) == (moved < 0.0002 and turned_deg < 0.3)

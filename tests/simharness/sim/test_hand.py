@@ -220,3 +220,22 @@ def test_a_hand_closes_on_a_box_with_parallel_pads_and_presses(world: World, nam
     assert hand.width == pytest.approx(thickness, abs=0.001)
     assert hand.finger_speed < 0.002
     np.testing.assert_allclose(hand.T_world_grasp.translation, [0.0, 0.0, 0.02], atol=0.0015)
+
+
+@pytest.mark.parametrize("name", HANDS)
+@pytest.mark.parametrize("share", [0.0, 0.3, 0.7, 1.0])
+def test_any_hand_is_placed_by_its_tcp_however_wide_it_is(world: World, name: str, share: float) -> None:
+    """Tips that swing are farther from the base link as they close, and that stands so much farther back."""
+    gripper = HANDS[name].gripper
+    hand, width = Hand(world, HANDS[name]), share * gripper.max_width
+    wanted = Pose.from_quaternion([0.3, 0.8, -0.2, 0.4], [0.1, 0.2, 0.3])
+    hand.place(wanted.matrix, width)
+    np.testing.assert_allclose(hand.T_world_grasp.matrix, wanted.matrix, atol=1e-9)
+    base = wanted.apply([0.0, 0.0, -float(gripper.tcp_at(width))])
+    np.testing.assert_allclose(world.pose(hand.body).translation, base, atol=1e-9)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_no_hand_closes_with_less_than_the_least_force_that_it_can_be_told(world: World, name: str) -> None:
+    known = HANDS[name]
+    assert max(20.0, known.min_force) == Hand(world, known)._force <= max(20.0, known.max_force)
