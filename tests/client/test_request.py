@@ -176,7 +176,7 @@ def plain(value: Any) -> Any:
 def test_every_option_arrives_as_it_was_given_however_it_travels(name: str, way: str) -> None:
     options = {name: EVERY_OPTION[name]}
     if way == "depth":
-        camera = {"fx": 50.0, "fy": 50.0, "cx": 1.0, "cy": 1.0}
+        camera: Intrinsics = {"fx": 50.0, "fy": 50.0, "cx": 1.0, "cy": 1.0}
         request = depth_request(np.ones((4, 4)), camera, options)
     else:
         request = points_request(CLOUD, options, normals=np.eye(2, 3) if way == "form" else None)

@@ -41,8 +41,9 @@ def test_a_place_counts_as_deep_in_the_hand_where_the_twin_says_so(name: str, de
     hand = HANDS_TO_TRY[name]
     for width in (0.0, hand.max_width):
         places = np.random.default_rng(2).uniform(-0.16, 0.16, (200_000, 3))
+        x, y, z = torch.from_numpy(places).unbind(dim=1)
         deep = depth_in_hand(places, hand, width)
-        inside = inside_hand(*torch.from_numpy(places).unbind(dim=1), hand, width, 0.0, depth).numpy()
+        inside = inside_hand(x, y, z, hand, width, 0.0, depth).numpy()
         certain = np.abs(deep - depth) > 1e-9
         np.testing.assert_array_equal(inside[certain], deep[certain] > depth)
 

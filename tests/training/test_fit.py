@@ -255,7 +255,7 @@ def test_a_step_goes_along_the_mean_slope_of_its_views_which_is_at_most_one_long
         successes = float(view.success.double().mean())
         mean_slope += (chance - successes) * steepness * inputs / 2
         mean_loss -= (successes * math.log(chance) + (1 - successes) * math.log(1 - chance)) / 2
-    length = np.linalg.norm(mean_slope)
+    length = float(np.linalg.norm(mean_slope))
     assert (length > 1) == (steepness > 1)
     step = network.slopes.detach().numpy() - slopes
     np.testing.assert_allclose(step, -0.5 * mean_slope / max(1.0, length), rtol=1e-3, atol=1e-6)

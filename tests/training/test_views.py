@@ -89,6 +89,25 @@ def test_files_of_pairs_alone_are_those_of_the_open_hand(tmp_path: Path) -> None
     assert old.gripper == PANDA
 
 
+@pytest.mark.parametrize("as_mask", [True, False])
+def test_of_a_view_with_only_some_candidates_each_keeps_all_that_is_its_own(as_mask: bool) -> None:
+    rng = np.random.default_rng(0)
+    view = replace(
+        labelled_view(count=30),
+        widths=torch.linspace(0.01, 0.08, 30),
+        outcomes=torch.from_numpy(rng.integers(0, 4, 30).astype(np.uint8)),
+        collision_free=torch.from_numpy(rng.random(30) < 0.5),
+    )
+    rows = np.flatnonzero(rng.random(30) < 0.4) if as_mask else rng.permutation(30)[:11]
+    which = torch.zeros(30, dtype=torch.bool) if as_mask else torch.from_numpy(rows)
+    if as_mask:
+        which[rows] = True
+    some = view.only(which)
+    assert some.cloud is view.cloud
+    for name in ("poses", "widths", "approach", "contact", "outcomes", "collision_free", "success"):
+        assert torch.equal(getattr(some, name), torch.stack([getattr(view, name)[row] for row in rows.tolist()]))
+
+
 def test_a_scene_without_views_round_trips(tmp_path: Path) -> None:
     save_scene(tmp_path / "scene_0.npz", {"number": 0}, [])
     description, views = load_scene(tmp_path / "scene_0.npz")

@@ -3,12 +3,13 @@
 from __future__ import annotations
 
 from collections.abc import Iterator
+from pathlib import Path
 
 import numpy as np
 import pytest
 
 from simharness.errors import LoadError
-from simharness.sim.world import GRAVITY, TIMESTEP, World, data_path
+from simharness.sim.world import BASE_LINK, GRAVITY, TIMESTEP, World, data_path
 from tesnet.geometry import Pose
 
 pytestmark = pytest.mark.sim
@@ -105,3 +106,27 @@ def test_a_closed_world_may_be_closed_again() -> None:
     world = World()
     world.close()
     world.close()
+
+
+SLOPE = """<robot name="slope"><link name="base"><inertial><mass value="0"/>
+<inertia ixx="0" ixy="0" ixz="0" iyy="0" iyz="0" izz="0"/></inertial>
+<collision><geometry><box size="2 2 0.1"/></geometry></collision></link></robot>"""
+
+
+@pytest.mark.parametrize(("friction", "slides"), [(0.2, True), (0.3, True), (0.45, False), (0.9, False)])
+@pytest.mark.parametrize("mass", [0.05, 0.5])
+def test_an_object_slides_down_a_slope_that_is_steeper_than_its_friction(
+    world: World, tmp_path: Path, friction: float, slides: bool, mass: float
+) -> None:
+    """Whatever its file says, and however heavy it is: the slope's tangent is 0.36."""
+    (tmp_path / "slope.urdf").write_text(SLOPE)
+    half = np.deg2rad(20) / 2
+    tilt = Pose.from_quaternion([0.0, np.sin(half), 0.0, np.cos(half)], np.zeros(3))
+    slope = world.load_urdf(tmp_path / "slope.urdf", tilt)
+    world.set_dynamics(slope, BASE_LINK, lateralFriction=1.0)
+    start = tilt @ Pose(np.eye(3), np.array([0.0, 0.0, 0.05 + 0.0251]))
+    cube = world.load_object(CUBE, start, mass=mass, friction=friction)
+    world.step(240)
+    moved = float(np.linalg.norm(np.subtract(world.position(cube), start.translation)))
+    assert (moved > 0.1) == slides
+    assert (moved < 0.01) == (not slides)
