@@ -11,7 +11,7 @@ import torch
 
 from simharness.sim.protocol import query_about
 from tesnet import weights
-from tesnet.cloud import PreparationConfig, prepare
+from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, prepare
 from tesnet.collision import blocked
 from tesnet.geometry import Pose
 from tesnet.predictor import GraspPredictor
@@ -210,3 +210,20 @@ def test_views_of_old_scenes_were_taken_from_the_recorded_cameras_where_their_vi
         stood = [T_canonical_world.apply(places[(first + step) % 4]) for step in range(1 + others)]
         views.append(replace(view, cloud=replace(view.cloud, viewpoints=torch.tensor(np.array(stood)).float())))
     assert archive._cameras_of({"cameras": cameras}, views) == [cameras[1], cameras[3]]
+
+
+def test_views_that_are_rendered_with_too_few_points_are_left_out_of_their_scene(labels: Path, tmp_path: Path) -> None:
+    """As on a grid so coarse that small things have fewer points than the service answers."""
+    models = archive._models_by_kind("procedural-train")["packed"]
+    scene = archive._read_scene(next(path for path in scene_files([labels]) if load_scene(path)[1]))
+    labels_of_seed = {view.viewing.seed: len(view.outcomes) for view in scene.views}
+    kept = []
+    for number, voxel_size in enumerate((0.025, 0.04, 0.06)):
+        job = archive._Rendering(scene, tmp_path / f"scene_{number}.npz")
+        archive._render_scene(job, models, MoreViews(), PreparationConfig(voxel_size=voxel_size))
+        description, views = load_scene(job.path)
+        assert all(len(view.cloud) >= MINIMUM_POINTS for view in views)
+        told = [labels_of_seed[viewing["seed"]] for viewing in description["views"]]
+        assert [len(view.outcomes) for view in views] == told
+        kept.append(len(views))
+    assert kept[0] == len(scene.views) > kept[-1]

@@ -14,7 +14,7 @@ from simharness.sim.protocol import query_about
 from simharness.sim.scene import SCALE_RANGES, restore_scene, scales_for
 from simharness.sim.world import World
 from tesnet import networks, weights
-from tesnet.cloud import PreparationConfig, prepare
+from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, PreparedCloud, prepare
 from tesnet.hands import HANDS
 from tesnet.predictor import GraspPredictor
 from tesnet.query import GraspQuery
@@ -239,3 +239,22 @@ def test_things_are_as_large_as_the_hand_that_is_to_take_them(name: str, scale: 
     drawn = [item["scale"] / hints[item["name"]] * (middle if item["name"] in sized else 1.0) for item in things]
     assert len(drawn) >= 3
     assert low - 1e-9 <= min(drawn) < max(drawn) <= high + 1e-9
+
+
+def test_views_of_fewer_points_than_the_service_answers_have_no_labels(monkeypatch: pytest.MonkeyPatch) -> None:
+    """On a grid so coarse that some views of small things have too few."""
+    config = replace(CONFIG, views=2, things=1, labels_per_view=2)
+    sets, judge = generating.object_sets(config), generating.Judge(PreparationConfig(voxel_size=0.022))
+    sizes: list[int] = []
+
+    def noted(*arguments: Any) -> PreparedCloud | None:
+        ready = prepare(*arguments)
+        sizes.append(0 if ready is None else len(ready))
+        return ready
+
+    monkeypatch.setattr(generating.cloud, "prepare", noted)
+    for number in (2, 4, 5):
+        sizes.clear()
+        description, views = generating.label_scene(config, sets, number, judge)
+        assert [len(view.cloud) for view in views] == [size for size in sizes if size >= MINIMUM_POINTS]
+        assert len(description["views"]) == len(views) < len(sizes) == 2
