@@ -252,7 +252,7 @@ def test_views_of_fewer_points_than_the_service_answers_have_no_labels(monkeypat
         sizes.append(0 if ready is None else len(ready))
         return ready
 
-    monkeypatch.setattr(generating.cloud, "prepare", noted)
+    monkeypatch.setattr("tesnet.cloud.prepare", noted)
     for number in (2, 4, 5):
         sizes.clear()
         description, views = generating.label_scene(config, sets, number, judge)
