@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import asyncio
+import dataclasses
 import gzip
 import json
 import socket
@@ -16,6 +17,10 @@ import numpy as np
 import pytest
 
 import client
+from client.request import depth_request
+from service.payloads import decoder_for
+from service.schemas import MAX_TIMEOUT_S
+from tesnet.geometry import CameraIntrinsics, Pose
 from tests.client.conftest import Answering, Call, Peer, Reset, ScriptedServer, Stall, answering, model_document
 from tests.conftest import PATIENCE_S
 
@@ -39,6 +44,75 @@ def test_a_grasp_request_and_its_reply(
     np.testing.assert_array_equal(np.frombuffer(received.body, "<f4").reshape(-1, 3), points)
     query = parse_qs(urlsplit(received.target).query)
     assert {name: json.loads(value[0]) for name, value in query.items()} == {"up": [0, 0, 1], "max_grasps": 3}
+
+
+def test_all_that_is_said_of_a_depth_image_is_sent(call: Call, server: ScriptedServer, found: dict[str, Any]) -> None:
+    server.script = [answering(found)]
+    depth = np.full((6, 8), 0.5)
+    image: dict[str, Any] = {
+        "mask": np.eye(6, 8, dtype=np.uint8),
+        "T_cloud_camera": Pose.random(np.random.default_rng(0), reach=0.3).matrix,
+        "depth_scale": 0.0005,
+        "stride": 3,
+    }
+    camera = {"fx": 50.0, "fy": 60.0, "cx": 3.0, "cy": 2.5}
+    options = {"seed": 4, "gripper": "rg2"}
+    call(server.url, "grasps_from_depth", depth, intrinsics=camera, **image, **options, request_id="mine", timeout=200)
+    (received,) = server.received
+    expected = depth_request(depth, CameraIntrinsics(8, 6, **camera), options, **image)
+    payloads = [
+        decoder_for(kind)(bytearray(body), 1000)
+        for kind, body in (
+            (received.headers["content-type"], received.body),
+            (expected.headers["Content-Type"], expected.content),
+        )
+    ]
+    for sent, wanted in zip(*map(dataclasses.astuple, payloads), strict=True):
+        np.testing.assert_equal(sent, wanted)
+    assert received.headers["x-request-id"] == "mine"
+    assert 100 < float(received.headers["x-request-timeout"]) < 200
+
+
+def test_normals_and_views_are_sent_with_their_points(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    normals, index = np.roll(points, 1, axis=1), np.arange(len(points)) % 2
+    call(server.url, "grasps", points, normals=normals, view_index=index, viewpoint=[[0, 0, 1], [1, 0, 1]])
+    (received,) = server.received
+    payload = decoder_for(received.headers["content-type"])(bytearray(received.body), len(points))
+    np.testing.assert_array_equal(payload.points, points)
+    np.testing.assert_array_equal(payload.normals, normals)
+    np.testing.assert_array_equal(payload.view_index, index)
+
+
+@pytest.mark.parametrize("timeout", [0.0, -1.0, MAX_TIMEOUT_S * 1.01, float("nan")])
+def test_a_time_out_that_no_request_may_have_is_refused_for_the_client_and_for_a_call(
+    call: Call, server: ScriptedServer, timeout: float
+) -> None:
+    server.script = [answering(model_document())]
+    with pytest.raises(client.InvalidArgument, match="timeout"):
+        call(server.url, "model", timeout=timeout)
+    with pytest.raises(client.InvalidArgument, match="timeout"):
+        call(server.url, "model", client={"timeout": timeout})
+    assert server.received == []
+    call(server.url, "model", timeout=MAX_TIMEOUT_S)
+
+
+def test_headers_of_the_caller_replace_none_that_a_request_needs(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    headers = {"Content-Type": "text/plain", "Accept": "text/html", "X-Request-ID": "other", "X-Robot": "7"}
+    call(server.url, "grasps", points, client={"headers": headers}, request_id="mine")
+    (received,) = server.received
+    told = {name: received.headers[name] for name in ("content-type", "accept", "x-request-id", "x-robot")}
+    assert told == {
+        "content-type": "application/octet-stream",
+        "accept": "application/json",
+        "x-request-id": "mine",
+        "x-robot": "7",
+    }
 
 
 def test_a_request_id_is_made_up_and_kept_over_retries(

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from tesnet import cloud
+from tesnet import cloud, smoothing
 from tesnet.geometry import Box, Pose
 from tesnet.query import GraspQuery
 from tesnet.support import SupportPlane
@@ -237,3 +237,36 @@ def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: f
     lowest = max(cloud.SUPPORT_NOISE, 3 * noise_sd)
     assert lowest - 1e-6 <= heights.min() < lowest + 0.003
     assert ready.support_error == noise_sd
+
+
+@pytest.mark.parametrize("noise_sd", [0.0005, 0.0025, 0.008])
+@pytest.mark.parametrize("smooths", [True, False])
+def test_where_preparation_follows_the_noise_what_a_given_supports_noise_lifts_is_dropped_up_to_a_centimetre(
+    noise_sd: float, smooths: bool
+) -> None:
+    """The noise is told by the points under the plane; here none of the surfaces is so noisy that it is smoothed."""
+    rng = np.random.default_rng(0)
+    things = rng.uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.06], (30_000, 3))
+    table = np.column_stack([rng.uniform(-0.1, 0.1, (3000, 2)), -np.abs(rng.normal(0, noise_sd, 3000))])
+    query = ask(np.concatenate([things, table]), viewpoints=CAMERA, up=UP, support_height=0.0)
+    ready = prepared(query, smooth_above=0.05 if smooths else None)
+    lowest = min(max(cloud.SUPPORT_NOISE, 3 * noise_sd), cloud.MOST_SUPPORT_NOISE) if smooths else cloud.SUPPORT_NOISE
+    heights = ready.T_cloud_canonical.apply(ready.points.numpy())[:, 2]
+    assert float(heights.min()) == pytest.approx(lowest + 0.001, abs=0.0015)
+
+
+def test_a_cloud_is_as_noisy_as_its_own_surfaces_or_its_support_whichever_is_noisier() -> None:
+    config = cloud.PreparationConfig(smooth_above=0.0015)
+    quiet = torch.from_numpy(tabletop(0)).float()
+    noisy = quiet + 0.003 * torch.randn(quiet.shape, generator=torch.Generator().manual_seed(0))
+    measured = smoothing.measured(noisy).sd
+    assert smoothing.measured(quiet).sd < 0.0015 < measured
+    for table, support_sd, sd in (
+        (quiet, 0.001, None),
+        (quiet, 0.003, 0.003),
+        (noisy, 0.0, measured),
+        (noisy, 0.02, 0.02),
+    ):
+        found = cloud._quieter(table, config, support_sd, lambda: None)
+        kept = smoothing.without_lone(table, smoothing.measured(table))
+        assert torch.equal(found, kept if sd is None else smoothing.smoothed(kept, sd))

@@ -68,7 +68,8 @@ def test_the_table_has_a_line_for_each_network_with_the_mean_of_its_runs(folder:
     assert table[1]["spread"] == {}
     assert table[1]["approach_points"] is None
     text = (tmp_path / "table1.md").read_text().splitlines()
-    accuracy = f"{100 * table[0]['measures']['accuracy']:.1f} +- "
+    half = table[0]["spread"]["accuracy"] / 2  # of the difference of the largest and the smallest
+    accuracy = f"{100 * table[0]['measures']['accuracy']:.1f} +- {100 * half:.1f}"
     assert text[2].startswith(f"| edgegrasp | {table[0]['parameters']:,} | {accuracy}")
     assert "| 88.3, 0.282 |" in text[2]
     assert len({line.count("|") for line in text[:4]}) == 1
