@@ -270,3 +270,28 @@ def test_a_cloud_is_as_noisy_as_its_own_surfaces_or_its_support_whichever_is_noi
         found = cloud._quieter(table, config, support_sd, lambda: None)
         kept = smoothing.without_lone(table, smoothing.measured(table))
         assert torch.equal(found, kept if sd is None else smoothing.smoothed(kept, sd))
+
+
+def test_of_much_that_stands_on_a_found_support_the_nearest_to_the_camera_is_looked_at() -> None:
+    """The rest still blocks hands; where nothing was found, or a target given, the usual limit holds."""
+    points = np.random.default_rng(0).uniform([-0.15, -0.15, 0.02], [0.15, 0.15, 0.06], (60_000, 3))
+    sides = np.array([[1.0, 0, 0, 0.3], [-1.0, 0, 0, 0.3], [0, 1.0, 0, 0.3], [0, -1.0, 0, 0.3]])
+    plane = SupportPlane(UP, 0.0, 0.5, 0.001, sides)
+    query = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0)
+    targeted = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0, target=Box(np.full(3, -1.0), np.full(3, 1.0)))
+    config = cloud.PreparationConfig()
+    found, whole, aimed = (
+        cloud.prepare(*asked) for asked in (
+            (query, config, CPU, plane), (query, config, CPU), (targeted, config, CPU, plane),
+        )
+    )  # fmt: skip
+    assert found is not None
+    assert whole is not None
+    assert aimed is not None
+    assert 0.9 * cloud.MOST_ON_SUPPORT < len(found) <= cloud.MOST_ON_SUPPORT < len(whole) <= config.max_points
+    assert len(aimed) > cloud.MOST_ON_SUPPORT
+    distance = (found.points - found.viewpoints[0]).norm(dim=1)
+    assert found.unsought is not None
+    beyond = (found.unsought.points - found.viewpoints[0]).norm(dim=1)
+    assert float(distance.max()) <= float(beyond.min()) + 0.005
+    assert len(beyond) > len(found)

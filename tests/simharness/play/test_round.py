@@ -1,11 +1,13 @@
 from __future__ import annotations
 
+import inspect
 from itertools import pairwise
 from typing import Any
 
 import numpy as np
 import pytest
 
+from simharness.play import round as playing
 from simharness.play.records import RoundRecord
 from simharness.play.round import (
     Attempted,
@@ -16,9 +18,12 @@ from simharness.play.round import (
     request_seed,
     scene_rng,
 )
+from simharness.sim.camera import Stand
 from simharness.sim.objects import ObjectModel
+from simharness.sim.scene import scales_for
 from simharness.sim.sensors.catalogue import SENSORS
 from simharness.sim.sensors.gaussian import DepthGaussian
+from tesnet.hands import HANDS
 from tests.simharness.planners import Alternating, Scripted, TopDown
 
 pytestmark = pytest.mark.sim
@@ -150,3 +155,45 @@ def test_what_replaces_the_cameras_noise_leaves_the_rest_of_its_sensor(make_sett
     assert camera_sensor(make_settings(sensor="dex", dex_noise=True)) == SENSORS["dex"]
     both = camera_sensor(make_settings(sensor="d435", depth_noise_std=0.001, noise_std=0.002))
     assert (set(both.depth), both.point_sigma) == ({*SENSORS["d435"].depth, DepthGaussian(0.001)}, 0.002)
+
+
+@pytest.mark.parametrize(
+    "changes",
+    [
+        {},
+        {"camera": "top", "polar_deg": 40.0, "distance": 0.5, "voxel_size": 0.01},
+        {"calibrate": True, "sensor": "d435", "executor": "strict"},
+        {"calibrate": True, "table_in_view": False, "scene": "pile", "objects": "procedural"},
+        {"table_in_view": True, "gripper": "rg2"},
+    ],
+)
+def test_a_round_is_played_as_its_settings_say(
+    changes: dict[str, Any], objects: tuple[ObjectModel, ...], make_settings: Any, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Its scene, its camera and its hand; what is looked for is what the functions are told that do these."""
+    told: dict[str, dict[str, Any]] = {}
+    for name in ("make_scene", "observe", "attempt"):
+        real = getattr(playing, name)
+
+        def noted(*arguments: Any, real: Any = real, name: str = name, **options: Any) -> Any:
+            bound = inspect.signature(real).bind(*arguments, **options)
+            bound.apply_defaults()
+            told[name] = dict(bound.arguments)
+            return real(*arguments, **options)
+
+        monkeypatch.setattr(playing, name, noted)
+    settings = make_settings(**changes)
+    record = play_round(settings, objects, Scripted([None, None]), 4, 6)
+    hand = HANDS[changes.get("gripper", "franka")].gripper
+    scene, view, tried = told["make_scene"], told["observe"], told["attempt"]
+    assert (scene["kind"], scene["num_objects"]) == (settings.scene, 5)
+    assert scene["scale_range"] == scales_for(settings.scene, hand)
+    assert view["preset"] == settings.camera
+    assert view["sensor"] == camera_sensor(settings)
+    assert view["stand"] == Stand(changes.get("polar_deg"), changes.get("distance"))
+    assert view["voxel_size"] == changes.get("voxel_size")
+    assert view["table_in_view"] == changes.get("table_in_view", changes.get("calibrate", False))
+    assert tried["executor"] == settings.executor
+    assert tried["hand"].gripper == hand
+    np.testing.assert_array_equal(tried["T_world_grasp"], record.attempts[-1].T_world_grasp)
+    assert tried["width"] == record.attempts[-1].width

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+import inspect
 import json
 import os
 import signal
@@ -13,7 +14,9 @@ import pytest
 
 from simharness.__main__ import main
 from simharness.errors import RunBroken
+from simharness.play import run as running
 from simharness.play.folder import RunFolder
+from simharness.play.planner import HttpPlanner
 from simharness.play.records import ModelRecord, RoundRecord, Serving
 from simharness.play.run import Hooks, _Log, _Rounds
 from simharness.play.server import LocalService
@@ -145,3 +148,17 @@ def test_rounds_are_written_in_their_order_whatever_the_order_they_finish_in(
     for name, each in (("rounds.jsonl", 1), ("attempts.jsonl", 2)):
         written = [(line["seed"], line["round"]) for line in lines(tmp_path / name)]
         assert written == [key for key in sorted(arriving) for _ in range(each)]
+
+
+def test_the_service_is_asked_as_the_settings_say(make_settings: Any, monkeypatch: pytest.MonkeyPatch) -> None:
+    settings = make_settings(model="gpd", max_grasps=7, gripper="rg2", calibrate=True)
+    told: list[dict[str, Any]] = []
+
+    def noted(*arguments: Any, **options: Any) -> None:
+        told.append(inspect.signature(HttpPlanner).bind(*arguments, **options).arguments)
+
+    monkeypatch.setattr(running, "HttpPlanner", noted)
+    for asked in (settings, make_settings()):
+        running._planner("http://service.test", asked)
+    expected = {"url": "http://service.test", "model": "gpd", "max_grasps": 7, "gripper": "rg2", "calibrate": True}
+    assert told == [expected, expected | {"model": "tesnet", "max_grasps": 1, "gripper": "franka", "calibrate": False}]
