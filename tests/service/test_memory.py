@@ -69,3 +69,13 @@ def test_what_lies_there_gives_way_to_a_request() -> None:
     assert closed == []
     request.resize(20)
     assert (closed, memory.held) == (["closed"], 20)
+
+
+def test_what_lies_there_alone_may_be_of_any_size_until_something_else_is_held() -> None:
+    memory = Memory(100)
+    lone, other = memory.share(), memory.share()
+    closed: list[str] = []
+    memory.keep_lying(lone, 900, lambda: closed.append("lone"))
+    assert (closed, memory.held) == ([], 900)
+    memory.keep_lying(other, 5, lambda: closed.append("other"))
+    assert (closed, memory.held) == (["lone"], 5)
