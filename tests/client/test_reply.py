@@ -226,11 +226,13 @@ def test_a_date_to_retry_after_is_that_of_greenwich_wherever_the_client_runs(
 ) -> None:
     """In each of the forms that HTTP knows, two of which name no zone of their own."""
     text = (datetime.now(timezone.utc) + timedelta(hours=1)).strftime(form)
-    with monkeypatch.context() as patch:
-        patch.setenv("TZ", here)
+    try:
+        with monkeypatch.context() as patch:
+            patch.setenv("TZ", here)
+            time.tzset()
+            error = problem(Answer(503, {"retry-after": text}, refusing(503).body))
+    finally:
         time.tzset()
-        error = problem(Answer(503, {"retry-after": text}, refusing(503).body))
-    time.tzset()
     assert isinstance(error, client.Overloaded)
     assert error.retry_after is not None
     assert 3000 < error.retry_after <= 3600

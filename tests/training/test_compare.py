@@ -14,7 +14,7 @@ from tests.tesnet.scenes import tabletop_query
 from tests.training.synthetic import labelled_view, write
 from training import compare as comparing
 from training.__main__ import main
-from training.compare import compare, milliseconds, panels, read_runs
+from training.compare import Row, compare, markdown, milliseconds, panels, read_runs
 from training.fit import Recipe, fit
 from training.views import LabelsError
 
@@ -68,13 +68,35 @@ def test_the_table_has_a_line_for_each_network_with_the_mean_of_its_runs(folder:
     assert table[1]["spread"] == {}
     assert table[1]["approach_points"] is None
     text = (tmp_path / "table1.md").read_text().splitlines()
-    half = table[0]["spread"]["accuracy"] / 2  # of the difference of the largest and the smallest
-    accuracy = f"{100 * table[0]['measures']['accuracy']:.1f} +- {100 * half:.1f}"
+    accuracy = f"{100 * table[0]['measures']['accuracy']:.1f} +- "
     assert text[2].startswith(f"| edgegrasp | {table[0]['parameters']:,} | {accuracy}")
     assert "| 88.3, 0.282 |" in text[2]
     assert len({line.count("|") for line in text[:4]}) == 1
     assert (tmp_path / "figure6.svg").exists()
     assert (tmp_path / "figure6.png").exists()
+
+
+def test_each_number_of_a_row_stands_under_its_name() -> None:
+    """Rates in per cent; behind the mean of several runs half of what the largest and the smallest differ by."""
+    measures = {
+        "accuracy": 0.812,
+        "balanced_loss": 0.3456,
+        "balanced_accuracy": 0.723,
+        "auroc": 0.8912,
+        "average_precision": 0.567,
+    }
+    spread = {name: 0.02 * (1 + place) for place, name in enumerate(measures)}
+    row = Row("edgegrasp", [3, 4], 1234, measures, spread, 56.0, 7.0, 890, 12345, 16)
+    head, _, several, one = markdown([row, replace(row, spread={}, seeds=[3], approach_points=None)]).splitlines()[:4]
+    names = [cell.strip() for cell in head.split("|")[1:-1]]
+    cells = dict(zip(names, (cell.strip() for cell in several.split("|")[1:-1]), strict=True))
+    assert cells == {
+        "network": "edgegrasp", "parameters": "1,234", "accuracy %": "81.2 +- 1.0", "loss": "0.346 +- 0.020",
+        "paper": "88.3, 0.282", "balanced accuracy %": "72.3 +- 3.0", "AUROC": "0.891 +- 0.040", "AP": "0.567 +- 0.050",
+        "ms a cloud (network)": "56 (7)", "views": "890", "labels": "12,345 *16", "seeds": "3, 4",
+    }  # fmt: skip
+    alone = dict(zip(names, (cell.strip() for cell in one.split("|")[1:-1]), strict=True))
+    assert (alone["accuracy %"], alone["AP"], alone["labels"]) == ("81.2", "0.567", "12,345")
 
 
 def test_untrained_and_shipped_rows_are_measured_where_labels_are_given(folder: Path, tmp_path: Path) -> None:
