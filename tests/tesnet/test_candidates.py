@@ -18,7 +18,7 @@ from tesnet.geometry import PANDA, Gripper, Pose
 from tesnet.hands import HANDS
 from tesnet.outline import Outline, outline
 from tesnet.points import farthest_points
-from tesnet.query import ApproachCone
+from tesnet.query import MAX_APPROACH_POINTS, ApproachCone
 from tests.tesnet.hand_twin import HANDS_TO_TRY, depth_in_hand
 from tests.tesnet.raycast import Bowl, Slab, overhead_query
 from tests.tesnet.scenes import (
@@ -67,6 +67,14 @@ def coverage(points: Array, chosen: list[int]) -> float:
 
 
 # Approach points
+
+
+def test_four_times_as_many_approach_points_are_tried_each_time_up_to_the_limit() -> None:
+    counts = [1]
+    while counts[-1] < MAX_APPROACH_POINTS and len(counts) < 20:
+        counts.append(candidates.more_approach_points(counts[-1]))
+    assert counts == [1, 4, 16, 64, 256, 1024]
+    assert candidates.more_approach_points(300) == MAX_APPROACH_POINTS == 1024
 
 
 @given(seed=st.integers(0, 2), count=st.sampled_from([2, 8, 32, 100]), start=st.integers(0, 1000))
