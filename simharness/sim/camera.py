@@ -31,6 +31,9 @@ INTRINSICS = CameraIntrinsics(width=640, height=480, fx=540.0, fy=540.0, cx=320.
 NEAR, FAR = 0.1, 2.0
 """Metres; nothing nearer or farther is seen."""
 
+_SKY = 1.0 - 1e-7
+"""In the renderer's buffer: empty pixels fall short of 1 by the rounding of float32."""
+
 _TABLE_BOX = Box(np.array([-0.1, -0.1, -0.1]), np.array([0.4, 0.4, 0.35]))
 """Table and things as far as wrong scales and poses may move them."""
 
@@ -165,7 +168,7 @@ def render(world: World, T_world_camera: Pose, *, segmentation: bool = True) -> 
     )
     buffer = buffer.astype(np.float64)
     depth = FAR * NEAR / (FAR - (FAR - NEAR) * buffer)
-    depth[buffer >= 1.0] = 0.0
+    depth[buffer >= _SKY] = 0.0
     return Images(depth.astype(np.float32), colour, bodies)
 
 

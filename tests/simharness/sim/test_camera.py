@@ -27,6 +27,7 @@ from simharness.sim.sensors.catalogue import SENSORS
 from simharness.sim.sensors.gaussian import DepthGaussian
 from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
+from tesnet.geometry import Pose
 
 pytestmark = pytest.mark.sim
 
@@ -59,6 +60,17 @@ def test_rendered_depth_lies_on_the_surfaces_to_a_hundredth_of_a_millimetre(worl
     assert np.abs(front[:, 1] - 0.12).max() < 1e-5
     # Half a pixel of error in the columns would move the middle by half a millimetre.
     assert top[:, 0].mean() == pytest.approx(0.15, abs=1e-4)
+
+
+@pytest.mark.parametrize("place", [(0.15, -0.6, 0.3), (0.9, 0.15, 0.06), (0.15, 0.15, 0.8)])
+def test_depth_is_where_a_body_is_and_nowhere_else(world: World, place: tuple[float, float, float]) -> None:
+    """The sky, which some of these cameras see, has none."""
+    images = render(world, Pose.look_at(place, [0.15, 0.15, 0.1501], [0.0, 1.0, 1.0]))
+    bodies = images.segmentation >= 0
+    assert bodies.any()
+    assert bodies.all() == (place[2] > 0.5)
+    np.testing.assert_array_equal(images.depth > 0, bodies)
+    assert images.depth.max() < FAR - 1e-3
 
 
 def test_colour_and_segmentation_show_the_same_body(world: World) -> None:
