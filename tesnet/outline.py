@@ -82,15 +82,19 @@ def outline(cloud: PreparedCloud, query: GraspQuery) -> Outline:
     What such a caller's image cut off cannot be told from an edge.
     """
     travel = -(cloud.view_directions if cloud.up is None else cloud.up.expand_as(cloud.points))
-    outward, is_edge = _ends(cloud, travel)
-    is_edge &= (cloud.normals * -travel).sum(dim=1) > _FLATTEST
+    ends = _Ends.of(cloud, travel)
+    is_edge = ends.one_sided & ((cloud.normals * -travel).sum(dim=1) > _FLATTEST)
     if cloud.up is not None:
         is_edge &= (cloud.view_directions @ cloud.up >= _STEEPEST_SIGHT) | is_low(cloud)
-    walls = (cloud.normals[cloud.neighbours] * outward[:, None]).sum(dim=2) > _WALL
-    found = (is_edge & ~walls.any(dim=1)).nonzero()[:, 0]
+    found = is_edge.nonzero()[:, 0]
+    outward = _across_line(ends.level[found], ends.on_edge_of(cloud, found), ends.outward[found], travel[found])
+    walls = (cloud.normals[cloud.neighbours[found]] * outward[:, None]).sum(dim=2) > _WALL
+    ends_in_air = ~walls.any(dim=1)
+    found, outward = found[ends_in_air], outward[ends_in_air]
     if len(found):
-        found = found[_falls_away(cloud, query, found, outward[found])]
-    return Outline(found, outward[found], travel[found])
+        away = _falls_away(cloud, query, found, outward)
+        found, outward = found[away], outward[away]
+    return Outline(found, outward, travel[found])
 
 
 def is_low(cloud: PreparedCloud) -> Tensor:
@@ -100,17 +104,39 @@ def is_low(cloud: PreparedCloud) -> Tensor:
     return cloud.points @ cloud.up - cloud.support_height < LOW
 
 
-def _ends(cloud: PreparedCloud, travel: Tensor) -> tuple[Tensor, Tensor]:
-    """Unit directions (P, 3) away from the neighbours on the same face, and a mask of where these are one-sided."""
-    offsets = cloud.points[cloud.neighbours] - cloud.points[:, None]
-    rise = (offsets * travel[:, None]).sum(dim=2)
-    level = offsets - rise[..., None] * travel[:, None]
-    weight = (rise.abs() <= _SAME_FACE).to(level.dtype)[..., None]
-    mean = (level * weight).sum(dim=1)
-    is_edge = mean.norm(dim=1) > _ONE_SIDED * (level.norm(dim=2, keepdim=True) * weight).sum(dim=1)[:, 0]
-    outward = normalize(-mean, dim=1)
-    alike = is_edge[cloud.neighbours] & ((outward[cloud.neighbours] * outward[:, None]).sum(dim=2) > _ONE_EDGE)
-    return _across_line(level, alike & (weight[..., 0] > 0), outward, travel), is_edge
+@dataclass(frozen=True, eq=False, slots=True)
+class _Ends:
+    """Where faces end, at first sight.
+
+    Args:
+        level: (P, k, 3) offsets of the neighbours, across the travel.
+        same_face: (P, k) whether the neighbour is of the point's face.
+        outward: (P, 3) unit directions away from the neighbours on the same face.
+        one_sided: (P,) whether these are all on one side.
+    """
+
+    level: Tensor
+    same_face: Tensor
+    outward: Tensor
+    one_sided: Tensor
+
+    @classmethod
+    def of(cls, cloud: PreparedCloud, travel: Tensor) -> _Ends:
+        """Those of a cloud, for hands that travel (P, 3) that way."""
+        offsets = cloud.points[cloud.neighbours] - cloud.points[:, None]
+        rise = (offsets * travel[:, None]).sum(dim=2)
+        level = offsets - rise[..., None] * travel[:, None]
+        same_face = rise.abs() <= _SAME_FACE
+        weight = same_face.to(level.dtype)[..., None]
+        mean = (level * weight).sum(dim=1)
+        one_sided = mean.norm(dim=1) > _ONE_SIDED * (level.norm(dim=2, keepdim=True) * weight).sum(dim=1)[:, 0]
+        return cls(level, same_face, normalize(-mean, dim=1), one_sided)
+
+    def on_edge_of(self, cloud: PreparedCloud, rows: Tensor) -> Tensor:
+        """Mask (R, k) of the neighbours that are on the same edge as the points `rows` (R,)."""
+        neighbours = cloud.neighbours[rows]
+        alike = (self.outward[neighbours] * self.outward[rows][:, None]).sum(dim=2) > _ONE_EDGE
+        return self.one_sided[neighbours] & alike & self.same_face[rows]
 
 
 def _across_line(level: Tensor, on_line: Tensor, outward: Tensor, travel: Tensor) -> Tensor:
