@@ -17,14 +17,14 @@ COARSEST_RESOLUTION = 0.0005
 """Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
 
 
-def of_query(query: GraspQuery) -> list[str]:
-    """What the query itself leaves open."""
+def of_query(query: GraspQuery, *, knows_hands: bool) -> list[str]:
+    """What the query itself leaves open, for a network that knows other hands than the Franka one or does not."""
     notes = list(query.notes)
     if query.viewpoints is None:
         notes.append(NO_VIEWPOINT)
     if query.up is None:
         notes.append("up not given: grasps from below are not filtered, only those that come from behind what is seen")
-    if query.gripper != PANDA:
+    if query.gripper != PANDA and not knows_hands:
         notes.append("gripper is not the hand that the network was trained with: only collision and width follow it")
     return notes
 

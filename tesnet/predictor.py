@@ -191,7 +191,12 @@ class GraspPredictor:
         rejected = dict.fromkeys(REJECTIONS, 0)
         query, corrected = calibration.calibrated(query)
         query, plane, said = support.settled(query)
-        notes = [*notices.of_query(query), *corrected, *said, *notices.of_support(query)]
+        notes = [
+            *notices.of_query(query, knows_hands=self._network.knows_hands),
+            *corrected,
+            *said,
+            *notices.of_support(query),
+        ]
 
         clock.check()
         prepared = cloud.prepare(query, self._preparation, self.device, plane, clock.check)

@@ -64,6 +64,7 @@ class BallNetwork(nn.Module):
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
     scored_at_once: ClassVar[int] = 200
+    knows_hands: ClassVar[bool] = False
 
     def __init__(self, config: BallConfig, features: int) -> None:
         super().__init__()

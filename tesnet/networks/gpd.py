@@ -51,6 +51,7 @@ class GPD(nn.Module):
 
     preparation: ClassVar[PreparationConfig] = FINE
     scored_at_once: ClassVar[int] = 200
+    knows_hands: ClassVar[bool] = False
 
     def __init__(self, config: GPDConfig) -> None:
         super().__init__()

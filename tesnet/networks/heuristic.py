@@ -46,6 +46,7 @@ class Heuristic(nn.Module):
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
     scored_at_once: ClassVar[int] = 2_500
+    knows_hands: ClassVar[bool] = False
 
     def __init__(self, config: HeuristicConfig) -> None:
         super().__init__()

@@ -33,6 +33,11 @@ class Network(Protocol):
 
     def __init__(self, config: Any) -> None: ...
 
+    @property
+    def knows_hands(self) -> bool:
+        """Whether scores are those of the candidates' hand; else they are the Franka hand's, whatever the hand."""
+        ...
+
     def encode_batch(self, clouds: Sequence[PreparedCloud]) -> list[Any]:
         """What `score` needs of each cloud, one value a cloud, computed once however many candidates it has.
 

@@ -58,6 +58,7 @@ class PointNetGPD(nn.Module):
 
     preparation: ClassVar[PreparationConfig] = FINE
     scored_at_once: ClassVar[int] = 200
+    knows_hands: ClassVar[bool] = False
 
     def __init__(self, config: PointNetGPDConfig) -> None:
         super().__init__()

@@ -116,6 +116,11 @@ class TesNet(nn.Module):
         if config.told:
             self.told = Told(config)
 
+    @property
+    def knows_hands(self) -> bool:
+        """Whether it is told the hand."""
+        return self.config.told
+
     def encode_batch(self, clouds: Sequence[PreparedCloud]) -> list[CloudFeatures]:
         """Features of every point and of the whole of each cloud, in one pass over the stacked graphs of all of them.
 

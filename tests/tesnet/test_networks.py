@@ -35,6 +35,7 @@ class Counting(torch.nn.Module):
 
     preparation: ClassVar[cloud.PreparationConfig] = cloud.PreparationConfig(voxel_size=0.006)
     scored_at_once: ClassVar[int] = 100
+    knows_hands: ClassVar[bool] = False
 
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()

@@ -13,10 +13,11 @@ import pytest
 import torch
 from scipy.spatial import cKDTree
 
-from tesnet import cloud, collision, weights
+from tesnet import cloud, collision, networks, notices, weights
 from tesnet import predictor as predictor_module
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box
+from tesnet.hands import HANDS
 from tesnet.predictor import GraspPredictor, configuration_of
 from tesnet.query import MAX_SEED, ApproachCone, GraspQuery
 from tesnet.result import REJECTIONS, GraspResult
@@ -572,3 +573,18 @@ def test_queries_whose_seeds_follow_each_other_share_no_search() -> None:
         seeds = [query.seed for query in (*queries, *further)]
         assert len(set(seeds)) == len(seeds)
         assert {query.num_approach_points for query in further} == {4 * 32}
+
+
+@pytest.mark.parametrize("knows_hands", [True, False])
+def test_another_hand_is_warned_of_where_the_network_does_not_know_it(knows_hands: bool) -> None:
+    asked = {hand: tabletop_query().but(gripper=HANDS[hand].gripper) for hand in ("franka", "rg2")}
+    warned = {
+        hand: any("not the hand" in note for note in notices.of_query(query, knows_hands=knows_hands))
+        for hand, query in asked.items()
+    }
+    assert warned == {"franka": False, "rg2": not knows_hands}
+
+
+@pytest.mark.parametrize("told", [True, False])
+def test_a_network_knows_hands_where_it_is_told_of_them(told: bool) -> None:
+    assert networks.build("tesnet", {"told": told}).knows_hands == told
