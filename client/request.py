@@ -136,7 +136,8 @@ class GraspOptions(TypedDict, total=False):
         num_approach_points: search effort (default 32).
         max_candidates: search effort (default 2000).
         gripper: a known hand's name, as `tesnet.hands` has them (default `"franka"`), or `{"max_width": 0.06, ...}`.
-        width: whether the hand arrives `"full"` open (default) or `"fitted"` to what was seen between its fingers.
+        width: whether the hand arrives `"full"` open (default) or `"fitted"` to what was seen between its fingers
+            (default for hands whose tips swing forward as they close).
         unseen: whether the shadow behind observed points is `"free"` (default) or `"occupied"` for collisions.
         calibrate: whether depth scale and a small tilt are solved from the support that is seen (default False).
         pregrasp_distance: how far behind the grasp `pregrasp` lies (default 0.05).

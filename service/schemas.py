@@ -211,10 +211,11 @@ class GraspOptions(RequestPart):
         '{"max_width": metres, "finger_depth": metres, ...}, with a "name" those of that hand but for the sizes given. '
         f"It opens at most {WIDEST:g}. Default: franka.",
     )
-    width: Literal["fitted", "full"] = Field(
-        default="full",
+    width: Literal["fitted", "full"] | None = Field(
+        default=None,
         description="How far the hand opens before it approaches: by what was seen between its fingers and a margin, "
-        "or all it can. Fitted, it clears neighbours that it would hit wide open, but not what nobody saw.",
+        "or all it can. Fitted, it clears neighbours that it would hit wide open, but not what nobody saw. Default: "
+        "full, but fitted for hands whose tips swing forward as they close.",
     )
     unseen: Literal["free", "occupied"] = Field(
         default="free",

@@ -39,7 +39,10 @@ _UPWARD = 0.5
 
 _ROUNDING = 1e-5
 
-_WIDTH_STEP = 0.01
+_CLOSING_STEPS = 8
+
+_CLOSES_FARTHER = 0.01
+"""Fingers are taken to close this much farther, metres, than to the walls that they are expected to rest on."""
 
 _PAIRS_AT_ONCE = 500_000
 """Pairs of points whose offsets are in memory at a time, some 20 MB."""
@@ -247,11 +250,12 @@ def clear_of_support(
 ) -> tuple[Candidates, Tensor]:
     """The candidates, those stopped short that come too near to the support, and a mask of those that still do."""
     poses, hand = candidates.Ts_canonical_grasp, candidates.gripper
-    clearance = hand_clearance(cloud, poses, hand, candidates.widths)
+    clearance = hand_clearance(cloud, candidates)
     if cloud.up is None or cloud.support_height is None:
         return candidates, torch.zeros_like(clearance, dtype=torch.bool)
     travel = poses[:, :3, 2]
     reach = ((poses[:, :3, 3] - cloud.points[candidates.approach]) * travel).sum(dim=1) + hand.tip_offset
+    reach = reach + hand.tcp_at(resting_widths(cloud, candidates)) - hand.tcp_at(candidates.widths)
     back, too_near = stopping_short(
         -(travel @ cloud.up),
         clearance,
@@ -442,30 +446,34 @@ def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor, along: 
     return poses
 
 
-def hand_clearance(cloud: PreparedCloud, Ts_canonical_grasp: Tensor, gripper: Gripper, widths: Tensor) -> Tensor:
+def hand_clearance(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     """(C,) metres from the support plane to the lowest corner of the hand, open or closing; infinite without one.
 
-    Hands whose widths (C,) differ by less than `_WIDTH_STEP` are taken to be as wide as the widest of them may be.
+    Fingers are taken to close `_CLOSES_FARTHER` than to where they would rest.
     """
-    clearance = torch.full((len(Ts_canonical_grasp),), math.inf, device=Ts_canonical_grasp.device)
+    poses, hand, widths = candidates.Ts_canonical_grasp, candidates.gripper, candidates.widths
     if cloud.up is None or cloud.support_height is None:
-        return clearance
-    steps = (widths / _WIDTH_STEP - _ROUNDING).ceil()
-    for step in steps.unique().tolist():
-        alike = steps == step
-        width = min(step * _WIDTH_STEP, gripper.max_width)
-        clearance[alike] = _clearance(cloud, Ts_canonical_grasp[alike], gripper.closing_corners(width))
-    return clearance
+        return poses.new_full((len(poses),), math.inf)
+    up = (poses[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
+    on_the_way = [widths]
+    if hand.linkage_length is not None:  # tips that slide get no lower as they close
+        closed = torch.minimum((resting_widths(cloud, candidates) - _CLOSES_FARTHER).clamp(min=0.0), widths)
+        on_the_way = [torch.lerp(widths, closed, step / _CLOSING_STEPS) for step in range(_CLOSING_STEPS + 1)]
+    lowest = []
+    for part in hand.parts:
+        corners = torch.tensor(part.corners(0.0), dtype=poses.dtype, device=poses.device)
+        heights = (up @ corners.T).min(dim=1).values
+        for width in on_the_way if part.side else [widths]:
+            advance = hand.tcp_at(width) - hand.tcp_at(widths)
+            lowest.append(heights + part.side * up[:, 1] * width / 2 + up[:, 2] * advance)
+    return poses[:, :3, 3] @ cloud.up - cloud.support_height + torch.stack(lowest).min(dim=0).values
 
 
-def _clearance(cloud: PreparedCloud, poses: Tensor, places: NDArray[np.float64]) -> Tensor:
-    """(C,) metres from the support plane to the lowest of the places (K, 3) in the frame of each pose (C, 4, 4)."""
-    assert cloud.up is not None
-    assert cloud.support_height is not None
-    corners = torch.tensor(places, dtype=poses.dtype, device=poses.device)
-    up_in_grasp = (poses[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
-    tcp_height = poses[:, :3, 3] @ cloud.up - cloud.support_height
-    return tcp_height + (up_in_grasp @ corners.T).min(dim=1).values
+def resting_widths(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
+    """(C,) metres: opening at which each hand rests on its contact point and on a wall as far from its middle."""
+    poses, hand = candidates.Ts_canonical_grasp, candidates.gripper
+    along = ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
+    return 2 * along.clamp(0.0, hand.max_width / 2)
 
 
 def _comes_from_behind(cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig) -> Tensor:

@@ -80,9 +80,7 @@ def fitted(
     if len(candidates) == 0 or (policy == "full" and not config.centred):
         return candidates
     moved = _moved(cloud, candidates, config.centred, policy)
-    before, after = (
-        hand_clearance(cloud, some.Ts_canonical_grasp, some.gripper, some.widths) for some in (candidates, moved)
-    )
+    before, after = (hand_clearance(cloud, some) for some in (candidates, moved))
     low = after < before.clamp(max=config.support_clearance) - _ROUNDING
     return replace(
         moved,

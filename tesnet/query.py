@@ -62,7 +62,8 @@ class GraspQuery:
         num_approach_points, max_candidates: search effort.
         gripper: the hand, which opens no wider than `WIDEST`.
         unseen: whether the shadow behind observed points counts as `free` or `occupied`.
-        width: whether the hand arrives open by what lies between its fingers and a margin, or all it can.
+        width: whether the hand arrives open by what lies between its fingers and a margin, or all it can; None is
+            `opening_policy`'s choice.
         seed: makes sampling repeatable.
         model: the network that shall answer, where several are loaded; None for the first of them.
         view_index: (N,) which of the viewpoints saw each point, from 0; turns normals.
@@ -91,7 +92,7 @@ class GraspQuery:
     max_candidates: int = 2000
     gripper: Gripper = PANDA
     unseen: Literal["free", "occupied"] = "free"
-    width: Literal["fitted", "full"] = "full"
+    width: Literal["fitted", "full"] | None = None
     seed: int = 0
     model: str | None = None
     view_index: NDArray[np.uint8] | None = None
@@ -154,8 +155,18 @@ class GraspQuery:
         _whole_in_range("max_candidates", self.max_candidates, 1, MAX_CANDIDATES)
         _whole_in_range("seed", self.seed, 0, MAX_SEED)
         _one_of("unseen", self.unseen, "free", "occupied")
-        _one_of("width", self.width, "fitted", "full")
+        _one_of("width", self.width, "fitted", "full", None)
         _one_of("calibrate", self.calibrate, True, False)
+
+    @property
+    def opening_policy(self) -> Literal["fitted", "full"]:
+        """How far the hand opens: `full` unless asked, but `fitted` where closing swings the tips along the travel.
+
+        The RG2's tips advance by 44 mm from wide open to closed, and push away what they shall hold.
+        """
+        if self.width is not None:
+            return self.width
+        return "full" if self.gripper.linkage_length is None else "fitted"
 
     @property
     def candidate_limit(self) -> int:

@@ -59,7 +59,7 @@ def search(
     poses, widths = found.Ts_canonical_grasp.clone(), found.widths.clone()
     for rows in (~lost).nonzero()[:, 0].split(_FITTED_AT_ONCE):
         between()
-        some = fitted(cloud, found.select(rows), config, policy=query.width)
+        some = fitted(cloud, found.select(rows), config, policy=query.opening_policy)
         poses[rows], widths[rows] = some.Ts_canonical_grasp, some.widths
     found = replace(found, Ts_canonical_grasp=poses, widths=widths)
     is_free = ~lost

@@ -17,7 +17,7 @@ LIKE = 1.15
 COMPARED = ("max_width", "finger_depth", "finger_thickness", "finger_breadth")
 
 _FORCE = 20.0
-_SWINGING = 0.4
+_SWINGING = 0.7
 
 
 def drawn_hand(name: str, rng: np.random.Generator) -> KnownHand:
@@ -29,7 +29,7 @@ def random_hand(rng: np.random.Generator) -> KnownHand:
     """A parallel hand that opens 30 to 160 mm and is like none of those that networks are measured on.
 
     Sizes follow those of the nine hands of `tesnet.hands`: fingers grow with the opening, but less; a body is 20 to
-    125 mm longer than the opening; in 0.4 of them tips swing on cranks 0.53 to 0.78 times as long as the opening. The
+    125 mm longer than the opening; in 0.7 of those that open 60 mm and more tips swing on cranks 0.53 to 0.78 times as long as the opening. The
     Franka hand, which networks are trained for, may be met.
     """
     while True:

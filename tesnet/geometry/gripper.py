@@ -212,13 +212,5 @@ class Gripper:
         """
         return np.concatenate([part.corners(width) for part in self.parts])
 
-    def closing_corners(self, width: float) -> NDArray[np.float64]:
-        """`corners`, and those of the fingers on their way from `width` to closed, while the base link stands still."""
-        shifts = [(width, 0.0), *((w, self.tcp_at(w) - self.tcp_at(width)) for w in self.closing(width) if w != width)]
-        fingers = [
-            part.corners(w) + np.array([0.0, 0.0, shift]) for w, shift in shifts for part in self.parts if part.side
-        ]
-        return np.concatenate([*fingers, *(part.corners(width) for part in self.parts if not part.side)])
-
 
 PANDA = Gripper(name="franka")

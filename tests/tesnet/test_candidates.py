@@ -187,7 +187,7 @@ def lowest_corner(cloud_: cloud.PreparedCloud, found: Candidates) -> Array:
 
 def test_hand_clearance_is_that_of_the_lowest_corner() -> None:
     found, _ = candidates.generate(ready(), tabletop_query(), CandidateConfig(support_clearance=-1.0))
-    clearance = exact(candidates.hand_clearance(ready(), found.Ts_canonical_grasp, PANDA, found.widths))
+    clearance = exact(candidates.hand_clearance(ready(), found))
     np.testing.assert_allclose(clearance, lowest_corner(ready(), found), atol=ROUNDING)
     assert clearance.min() < 0 < clearance.max()
 
@@ -203,7 +203,9 @@ def test_no_part_of_a_hand_comes_lower_than_its_clearance(name: str) -> None:
     cloud_ = bare_cloud(rng.uniform(-0.1, 0.1, (50, 3)), up=torch.tensor(up).float(), support_height=-0.3)
     Ts = np.array([Pose.random(rng, reach=0.1).matrix for _ in range(30)])
     poses = torch.from_numpy(Ts).float()
-    clearance = exact(candidates.hand_clearance(cloud_, poses, hand, candidates.wide_open(poses, hand)))
+    point = torch.zeros(len(poses), dtype=torch.long)
+    found = candidates.Candidates(point, point, poses, candidates.wide_open(poses, hand), hand)
+    clearance = exact(candidates.hand_clearance(cloud_, found))
     lowest = np.array([(inside @ T[:3, :3].T @ up).min() + T[:3, 3] @ up + 0.3 for T in Ts])
     assert (lowest >= clearance - ROUNDING).all()
     np.testing.assert_allclose(lowest, clearance, atol=0.012)
@@ -225,7 +227,7 @@ def test_without_a_support_nothing_is_too_low() -> None:
     query = ask(tabletop(0), viewpoints=CAMERA, up=UP)
     found, rejected = candidates.generate(prepared(query), query, CONFIG)
     assert rejected["support"] == 0
-    assert torch.isinf(candidates.hand_clearance(prepared(query), found.Ts_canonical_grasp, PANDA, found.widths)).all()
+    assert torch.isinf(candidates.hand_clearance(prepared(query), found)).all()
 
 
 def test_without_up_nothing_comes_from_behind_what_is_seen() -> None:

@@ -158,15 +158,13 @@ def test_what_lies_between_the_fingers_is_what_each_pose_by_itself_has_there(nam
 
 def test_a_hand_that_would_come_too_low_keeps_its_place_and_its_width() -> None:
     """Any other is moved and told its width: each hand is wholly the one or wholly the other."""
-    query = tabletop_query(max_candidates=2000, gripper=(hand := HANDS["rg2"].gripper))
+    query = tabletop_query(max_candidates=2000, gripper=HANDS["rg2"].gripper)
     cloud = prepared(query)
     found, _ = generate(cloud, query, CandidateConfig())
     config = CandidateConfig(centred=True)
     result = fitting.fitted(cloud, found, config, policy="fitted")
     moved = fitting._moved(cloud, found, True, "fitted")
-    before, after = (
-        hand_clearance(cloud, some.Ts_canonical_grasp, hand, some.widths).double() for some in (found, moved)
-    )
+    before, after = (hand_clearance(cloud, some).double() for some in (found, moved))
     stays = after < before.clamp(max=config.support_clearance) - 1e-5
     assert 0 < int(stays.sum()) < len(found)
     assert ((moved.widths - found.widths).abs()[stays] > 1e-4).any()

@@ -148,18 +148,43 @@ def test_the_clearance_holds_for_the_lowest_tip_on_the_way(name: str) -> None:
     up = np.array([0.0, 0.6, 0.8])
     cloud = bare_cloud(rng.uniform(-0.1, 0.1, (50, 3)), up=torch.tensor(up).float(), support_height=-0.1)
     Ts = np.array([Pose.random(rng, reach=0.1).matrix for _ in range(40)])
-    found = candidates.hand_clearance(
-        cloud, torch.from_numpy(Ts).float(), hand, torch.full((len(Ts),), hand.max_width)
-    ).numpy()
-    for T, clearance in zip(Ts, found, strict=True):
+    contact, widths = rng.integers(50, size=40), rng.uniform(0.4, 1.0, 40) * hand.max_width
+    poses, opened = torch.from_numpy(Ts).float(), torch.from_numpy(widths).float()
+    found = candidates.Candidates(torch.zeros(40).long(), torch.from_numpy(contact), poses, opened, hand)
+    for row, clearance in enumerate(candidates.hand_clearance(cloud, found).tolist()):
+        T, width = Ts[row], widths[row]
+        along = (cloud.points[contact[row]].double().numpy() - T[:3, 3]) @ T[:3, 1]
+        closed = np.clip(
+            min(2 * along, hand.max_width) - 0.01, 0, width
+        )  # 10 mm narrower than the walls, which may be elsewhere
         lowest = np.inf
-        for width in np.linspace(hand.max_width, 0, 200) if name in ARCS else [hand.max_width]:
-            advance = from_base(hand, width) - from_base(hand, hand.max_width)
-            fingers = np.concatenate([part.corners(width) for part in hand.parts[:2]]) + np.array([0, 0, advance])
+        for closing in np.linspace(width, closed, 200) if name in ARCS else [width]:
+            advance = from_base(hand, closing) - from_base(hand, width)
+            fingers = np.concatenate([part.corners(closing) for part in hand.parts[:2]]) + np.array([0, 0, advance])
             places = np.concatenate([fingers, hand.parts[2].corners(width)]) @ T[:3, :3].T + T[:3, 3]
             lowest = min(lowest, float((places @ up).min()) + 0.1)
         assert clearance == pytest.approx(lowest, abs=4e-4)
-        assert clearance > lowest - 1e-5  # never more than what was looked at
+
+
+@pytest.mark.parametrize("name", ARCS)
+def test_a_low_thing_is_held_where_the_tips_come_to_rest_over_the_support(name: str) -> None:
+    """A slab 12 mm high, pairs of its top and of its wall: the hand stops short as if it had slid there closed."""
+    hand = HANDS[name].gripper
+    half = 0.3 * hand.max_width
+    points = torch.tensor([[0.0, 0.0, 0.012], [0.0, half, 0.008]], dtype=torch.float64)
+    cloud = bare_cloud(points.numpy(), up=torch.tensor([0.0, 0.0, 1.0]).double(), support_height=0.0)
+    normal = torch.tensor([[0.0, 1.0, 0.0]], dtype=torch.float64)
+    poses = candidates.grasp_poses(points[:1], points[1:], normal, hand=hand)
+    pair = torch.zeros(1).long(), torch.ones(1).long()
+    found = candidates.Candidates(*pair, poses, candidates.wide_open(poses, hand), hand)
+    cleared, too_near = candidates.clear_of_support(cloud, found, candidates.CandidateConfig())
+    assert not bool(too_near)
+    resting = from_base(hand, 2 * half) - from_base(hand, hand.max_width) + hand.tip_offset
+    tips = float(cleared.Ts_canonical_grasp[0, 2, 3]) - resting
+    deeper = max(from_base(hand, w) for w in np.linspace(2 * half, 2 * half - 0.01, 99)) - from_base(hand, 2 * half)
+    assert float(candidates.hand_clearance(cloud, cleared)) == pytest.approx(tips - deeper, abs=2e-4)
+    assert float(candidates.hand_clearance(cloud, cleared)) >= 0.0015 - 1e-9
+    assert 0.012 - tips >= 0.003  # so far past the face, or they slip off
 
 
 @pytest.mark.parametrize("name", NAMES)

@@ -241,3 +241,12 @@ def test_a_hand_with_a_very_long_part_has_fewer_candidates(part: str) -> None:
     asked = ask(points, gripper=large, max_candidates=MAX_CANDIDATES)
     assert asked.most_candidates == asked.candidate_limit == MAX_CANDIDATES_OF_LARGE_HANDS
     assert ask(points, gripper=large, max_candidates=7).most_candidates == 7
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_a_hand_opens_wide_unless_its_tips_swing_as_they_close(name: str) -> None:
+    hand = HANDS[name].gripper
+    swings = hand.travel > 0
+    assert ask(POINTS, gripper=hand).opening_policy == ("fitted" if swings else "full")
+    for asked in ("fitted", "full"):
+        assert ask(POINTS, gripper=hand, width=asked).opening_policy == asked

@@ -22,7 +22,7 @@ def test_what_is_free_is_what_a_check_of_every_fitted_hand_leaves(hand: Gripper,
     cloud, config = prepared(query), CandidateConfig()
     found = search(cloud, query, config)
     every, rejected = generate(cloud, query, config)
-    every = fitted(cloud, every, config, policy=query.width)
+    every = fitted(cloud, every, config, policy=query.opening_policy)
     free = ~blocked(cloud, every, query.unseen)
     assert 20 < int(free.sum()) < len(every)
     assert torch.equal(found.is_free, free)
