@@ -29,8 +29,8 @@ def random_hand(rng: np.random.Generator) -> KnownHand:
     """A parallel hand that opens 30 to 160 mm and is like none of those that networks are measured on.
 
     Sizes follow those of the nine hands of `tesnet.hands`: fingers grow with the opening, but less; a body is 20 to
-    125 mm longer than the opening; in 0.7 of those that open 60 mm and more tips swing on cranks 0.53 to 0.78 times as long as the opening. The
-    Franka hand, which networks are trained for, may be met.
+    125 mm longer than the opening; in 0.7 of those that open 60 mm and more tips swing on cranks 0.53 to 0.78 times as
+    long as the opening. The Franka hand, which networks are trained for, may be met.
     """
     while True:
         gripper = _draw(rng)
