@@ -495,3 +495,14 @@ def _outside_cone(cloud: PreparedCloud, z: Tensor, query: GraspQuery) -> Tensor:
     direction = cloud.T_cloud_canonical.inverse().rotate(query.approach.direction)
     wanted = torch.tensor(direction, dtype=z.dtype, device=z.device)
     return z @ wanted < math.cos(math.radians(query.approach.max_angle_deg)) - 1e-6
+
+
+def at_rest(cloud: PreparedCloud, candidates: Candidates) -> Candidates:
+    """The candidates, each TCP where it is once the fingers rest: of tips that slide, where it is as they arrive."""
+    hand = candidates.gripper
+    if hand.linkage_length is None:
+        return candidates
+    advance = hand.tcp_at(resting_widths(cloud, candidates)) - hand.tcp_at(candidates.widths)
+    poses = candidates.Ts_canonical_grasp.clone()
+    poses[:, :3, 3] += advance[:, None] * poses[:, :3, 2]
+    return replace(candidates, Ts_canonical_grasp=poses)

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from tesnet.candidates import CandidateConfig, Candidates, hand_clearance
+from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
 from tesnet.points import points_in_grasp_frames
@@ -45,8 +45,6 @@ _LEAST_SPREAD = 0.02
 
 _FEWEST = 6
 
-_ROUNDING = 1e-5
-
 _FARTHEST_UNSEEN = 0.02
 """No wall is taken to lie farther beyond what is seen."""
 
@@ -75,13 +73,13 @@ def fitted(
     """The candidates, midway between their walls where the configuration says so, the hand as wide as the policy says.
 
     `fitted` is what lies between the fingers and a margin beside each, `full` all that the hand opens. A hand whose
-    tips swing forward stands where they come to rest on the walls. One that would come too low there stays.
+    tips swing forward stands where they come to rest on the walls. One that would come too low there stops short, or
+    stays where that does not help.
     """
     if len(candidates) == 0 or (policy == "full" and not config.centred):
         return candidates
     moved = _moved(cloud, candidates, config.centred, policy)
-    before, after = (hand_clearance(cloud, some) for some in (candidates, moved))
-    low = after < before.clamp(max=config.support_clearance) - _ROUNDING
+    moved, low = clear_of_support(cloud, moved, config)
     return replace(
         moved,
         Ts_canonical_grasp=torch.where(low[:, None, None], candidates.Ts_canonical_grasp, moved.Ts_canonical_grasp),
@@ -107,7 +105,7 @@ def reach_of_fitting(
 def _moved(
     cloud: PreparedCloud, candidates: Candidates, centred: bool, policy: Literal["fitted", "full"]
 ) -> Candidates:
-    hand, span = candidates.gripper, spans(cloud, candidates)
+    hand, span = candidates.gripper, spans(cloud, at_rest(cloud, candidates))
     middle = (span.near + span.far) / 2
     shift = middle if centred else torch.zeros_like(middle)
     extent = (span.near - span.far + 2 * (middle - shift).abs()).clamp(0.0, hand.max_width)

@@ -15,7 +15,7 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from tesnet.candidates import Candidates
+from tesnet.candidates import Candidates, at_rest
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.layers import PointTransformerConv, SAGEConv
 from tesnet.networks.around_hand import PROBES, Region, ends, probes, region_about
@@ -154,7 +154,7 @@ class TesNet(nn.Module):
     def score(
         self, features: CloudFeatures, cloud: PreparedCloud, candidates: Candidates, mirror: Tensor | None = None
     ) -> Tensor:
-        """Logits (C,) of the candidates.
+        """Logits (C,) of the candidates, which are looked at where the fingers come to rest.
 
         Args:
             features: of this cloud.
@@ -163,6 +163,7 @@ class TesNet(nn.Module):
             mirror: (C,) +1 or -1; -1 shows the candidate's surroundings reflected in the hand's plane, under which the
                 outcome of a grasp does not change. For training.
         """
+        candidates = at_rest(cloud, candidates)
         poses = candidates.Ts_canonical_grasp
         sign = torch.ones(len(poses), device=poses.device) if mirror is None else mirror
         at_fingers = self.closing.members(cloud.points, candidates)

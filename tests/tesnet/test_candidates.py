@@ -527,3 +527,22 @@ def test_without_up_edges_make_candidates_for_want_of_others_alone(monkeypatch: 
     monkeypatch.setattr(candidates, "outline", lambda *_: pytest.fail("there are other candidates"))
     found, _ = candidates.generate(ready_, query, CONFIG)
     assert len(found) == query.max_candidates
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_at_rest_the_tips_lie_7_mm_past_the_contact_point(name: str) -> None:
+    """However wide the hand arrived; of tips that slide that is where they arrived."""
+    hand = HANDS[name].gripper
+    rng = np.random.default_rng(8)
+    points = torch.from_numpy(rng.uniform(-0.02, 0.02, (20, 3))).float()
+    cloud = bare_cloud(points.numpy())
+    pair = torch.zeros(19, dtype=torch.long), torch.arange(1, 20)
+    normals = torch.nn.functional.normalize(torch.from_numpy(rng.normal(size=(19, 3))).float(), dim=1)
+    poses = candidates.grasp_poses(points[pair[0]], points[pair[1]], normals, hand=hand)
+    found = candidates.Candidates(*pair, poses, candidates.wide_open(poses, hand), hand)
+    rest = candidates.at_rest(cloud, found).Ts_canonical_grasp
+    past = (rest[:, :3, 3] + hand.tip_offset * rest[:, :3, 2] - cloud.points[pair[1]]) * rest[:, :3, 2]
+    np.testing.assert_allclose(past.sum(dim=1).numpy(), 0.007, atol=1e-6)
+    assert torch.equal(rest[:, :3, :3], poses[:, :3, :3])
+    if hand.linkage_length is None:
+        assert torch.equal(rest, poses)

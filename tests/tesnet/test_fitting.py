@@ -5,7 +5,7 @@ import pytest
 import torch
 
 from tesnet import fitting
-from tesnet.candidates import CandidateConfig, Candidates, generate, hand_clearance
+from tesnet.candidates import CandidateConfig, Candidates, clear_of_support, generate, hand_clearance
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
@@ -163,10 +163,9 @@ def test_a_hand_that_would_come_too_low_keeps_its_place_and_its_width() -> None:
     found, _ = generate(cloud, query, CandidateConfig())
     config = CandidateConfig(centred=True)
     result = fitting.fitted(cloud, found, config, policy="fitted")
-    moved = fitting._moved(cloud, found, True, "fitted")
-    before, after = (hand_clearance(cloud, some).double() for some in (found, moved))
-    stays = after < before.clamp(max=config.support_clearance) - 1e-5
+    moved, stays = clear_of_support(cloud, fitting._moved(cloud, found, True, "fitted"), config)
     assert 0 < int(stays.sum()) < len(found)
+    assert bool((hand_clearance(cloud, moved)[~stays] >= 0.0015 - 1e-5).all())
     assert ((moved.widths - found.widths).abs()[stays] > 1e-4).any()
     for name in ("Ts_canonical_grasp", "widths"):
         told = getattr(result, name)
