@@ -254,15 +254,17 @@ def clear_of_support(
     if cloud.up is None or cloud.support_height is None:
         return candidates, torch.zeros_like(clearance, dtype=torch.bool)
     travel = poses[:, :3, 2]
-    reach = ((poses[:, :3, 3] - cloud.points[candidates.approach]) * travel).sum(dim=1) + hand.tip_offset
-    reach = reach + hand.tcp_at(resting_widths(cloud, candidates)) - hand.tcp_at(candidates.widths)
+    tips = at_rest(cloud, candidates).Ts_canonical_grasp[:, :3, 3] + hand.tip_offset * travel
+    past_approach, past_contact = (
+        ((tips - cloud.points[point]) * travel).sum(dim=1) for point in (candidates.approach, candidates.contact)
+    )
     back, too_near = stopping_short(
         -(travel @ cloud.up),
         clearance,
-        reach,
+        past_approach,
         wanted=config.support_clearance,
         error=cloud.support_error,
-        farthest=TIP_BEYOND_CONTACT,
+        farthest=past_contact.clamp(min=0.0) + _ROUNDING,
     )
     poses = poses.clone()
     poses[:, :3, 3] -= back[:, None] * travel
@@ -449,7 +451,8 @@ def _poses(approach_points: Tensor, z: Tensor, y: Tensor, depth: Tensor, along: 
 def hand_clearance(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     """(C,) metres from the support plane to the lowest corner of the hand, open or closing; infinite without one.
 
-    Fingers are taken to close `_CLOSES_FARTHER` than to where they would rest.
+    Tips that swing are followed until the opening is `_CLOSES_FARTHER` less than where they should come to rest; closed
+    on nothing, they come lower.
     """
     poses, hand, widths = candidates.Ts_canonical_grasp, candidates.gripper, candidates.widths
     if cloud.up is None or cloud.support_height is None:
@@ -457,8 +460,10 @@ def hand_clearance(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     up = (poses[:, :3, :3] * cloud.up[None, :, None]).sum(dim=1)
     on_the_way = [widths]
     if hand.linkage_length is not None:  # tips that slide get no lower as they close
-        closed = torch.minimum((resting_widths(cloud, candidates) - _CLOSES_FARTHER).clamp(min=0.0), widths)
+        closed = (resting_widths(cloud, candidates) - _CLOSES_FARTHER).clamp(min=0.0)
         on_the_way = [torch.lerp(widths, closed, step / _CLOSING_STEPS) for step in range(_CLOSING_STEPS + 1)]
+        farthest = torch.full_like(widths, 2 * hand.linkage_offset)
+        on_the_way.append(torch.minimum(torch.maximum(farthest, closed), widths))
     lowest = []
     for part in hand.parts:
         corners = torch.tensor(part.corners(0.0), dtype=poses.dtype, device=poses.device)
@@ -471,9 +476,23 @@ def hand_clearance(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
 
 def resting_widths(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     """(C,) metres: opening at which each hand rests on its contact point and on a wall as far from its middle."""
-    poses, hand = candidates.Ts_canonical_grasp, candidates.gripper
+    poses = candidates.Ts_canonical_grasp
     along = ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
-    return 2 * along.clamp(0.0, hand.max_width / 2)
+    return torch.minimum(2 * along.clamp(min=0.0), candidates.widths)
+
+
+def at_rest(cloud: PreparedCloud, candidates: Candidates) -> Candidates:
+    """The candidates, each TCP where it is once the fingers rest, while the palm stays where it is as they arrive.
+
+    Their widths stay those of arrival, so this is for looking at what is held, not for placing a hand.
+    """
+    hand = candidates.gripper
+    if hand.linkage_length is None:
+        return candidates
+    advance = hand.tcp_at(resting_widths(cloud, candidates)) - hand.tcp_at(candidates.widths)
+    poses = candidates.Ts_canonical_grasp.clone()
+    poses[:, :3, 3] += advance[:, None] * poses[:, :3, 2]
+    return replace(candidates, Ts_canonical_grasp=poses)
 
 
 def _comes_from_behind(cloud: PreparedCloud, candidates: Candidates, config: CandidateConfig) -> Tensor:
@@ -495,14 +514,3 @@ def _outside_cone(cloud: PreparedCloud, z: Tensor, query: GraspQuery) -> Tensor:
     direction = cloud.T_cloud_canonical.inverse().rotate(query.approach.direction)
     wanted = torch.tensor(direction, dtype=z.dtype, device=z.device)
     return z @ wanted < math.cos(math.radians(query.approach.max_angle_deg)) - 1e-6
-
-
-def at_rest(cloud: PreparedCloud, candidates: Candidates) -> Candidates:
-    """The candidates, each TCP where it is once the fingers rest: of tips that slide, where it is as they arrive."""
-    hand = candidates.gripper
-    if hand.linkage_length is None:
-        return candidates
-    advance = hand.tcp_at(resting_widths(cloud, candidates)) - hand.tcp_at(candidates.widths)
-    poses = candidates.Ts_canonical_grasp.clone()
-    poses[:, :3, 3] += advance[:, None] * poses[:, :3, 2]
-    return replace(candidates, Ts_canonical_grasp=poses)

@@ -24,7 +24,7 @@ _ROUNDING = 1e-5
 
 
 def stopping_short(
-    down: Tensor, clearance: Tensor, reach: Tensor, *, wanted: float, error: float, farthest: float
+    down: Tensor, clearance: Tensor, reach: Tensor, *, wanted: float, error: float, farthest: Tensor
 ) -> tuple[Tensor, Tensor]:
     """How far (C,) hands stop short of where they would come too near to the support, and which still come too near.
 
@@ -38,7 +38,7 @@ def stopping_short(
         reach: (C,) of their tips past the face, along the travel.
         wanted: the clearance to keep.
         error: of the height of the plane.
-        farthest: no hand stops farther short than this.
+        farthest: (C,) no hand stops farther short than this.
 
     Returns:
         (C,) along the travel, zero where the hand is clear or cannot get clear; and (C,) a mask of the latter.

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support
+from tesnet.candidates import TIP_BEYOND_CONTACT, CandidateConfig, Candidates, at_rest, clear_of_support
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
 from tesnet.points import points_in_grasp_frames
@@ -73,18 +73,19 @@ def fitted(
     """The candidates, midway between their walls where the configuration says so, the hand as wide as the policy says.
 
     `fitted` is what lies between the fingers and a margin beside each, `full` all that the hand opens. A hand whose
-    tips swing forward stands where they come to rest on the walls. One that would come too low there stops short, or
-    stays where that does not help.
+    tips swing forward stands where they come to rest on the walls. One that would come too low midway stops short;
+    where that does not help it stays where it is, as wide as the policy says if that is clear of the support.
     """
     if len(candidates) == 0 or (policy == "full" and not config.centred):
         return candidates
-    moved = _moved(cloud, candidates, config.centred, policy)
-    moved, low = clear_of_support(cloud, moved, config)
-    return replace(
-        moved,
-        Ts_canonical_grasp=torch.where(low[:, None, None], candidates.Ts_canonical_grasp, moved.Ts_canonical_grasp),
-        widths=torch.where(low, candidates.widths, moved.widths),
-    )
+    span, placed = spans(cloud, at_rest(cloud, candidates)), candidates
+    ways = [False] if policy == "fitted" else []
+    for centred in [*ways, True] if config.centred else ways:  # the last that is clear of the support counts
+        moved, low = clear_of_support(cloud, _moved(candidates, span, centred, policy), config)
+        poses, widths = moved.Ts_canonical_grasp, moved.widths
+        poses = torch.where(low[:, None, None], placed.Ts_canonical_grasp, poses)
+        placed = replace(placed, Ts_canonical_grasp=poses, widths=torch.where(low, placed.widths, widths))
+    return placed
 
 
 def reach_of_fitting(
@@ -92,20 +93,18 @@ def reach_of_fitting(
 ) -> tuple[Tensor, Tensor, float]:
     """How far `fitted` moves each hand along its closing direction, least and most (C,); how far along its travel.
 
-    The least is zero or less.
+    The least is zero or less. Along the travel the palm moves as the tips' swing and stopping short have it.
     """
     near, hand = _near_walls(cloud, candidates), candidates.gripper
+    rise = 2 * hand.travel + (0.0 if cloud.support_height is None else TIP_BEYOND_CONTACT)
     if not config.centred:
-        return torch.zeros_like(near), torch.zeros_like(near), 0.0
+        return torch.zeros_like(near), torch.zeros_like(near), rise
     least = (near - (hand.max_width + _FARTHEST_UNSEEN) / 2).clamp(max=0.0)
-    tips = [hand.tcp_at(width) for width in hand.closing(hand.max_width)]
-    return least, near.clamp(min=0.0), 2 * float(max(tips) - min(tips))
+    return least, near.clamp(min=0.0), rise
 
 
-def _moved(
-    cloud: PreparedCloud, candidates: Candidates, centred: bool, policy: Literal["fitted", "full"]
-) -> Candidates:
-    hand, span = candidates.gripper, spans(cloud, at_rest(cloud, candidates))
+def _moved(candidates: Candidates, span: Span, centred: bool, policy: Literal["fitted", "full"]) -> Candidates:
+    hand = candidates.gripper
     middle = (span.near + span.far) / 2
     shift = middle if centred else torch.zeros_like(middle)
     extent = (span.near - span.far + 2 * (middle - shift).abs()).clamp(0.0, hand.max_width)
@@ -117,7 +116,7 @@ def _moved(
     poses[:, :3, 3] += shift[:, None] * poses[:, :3, 1]
     if hand.linkage_length is not None:
         before, after = (2 * half.clamp(0.0, hand.max_width / 2) for half in (span.near, span.near - shift))
-        rise = hand.tcp_at(widths) - hand.hand_to_tcp - (hand.tcp_at(after) - hand.tcp_at(before))
+        rise = hand.tcp_at(widths) - hand.tcp_at(candidates.widths) - (hand.tcp_at(after) - hand.tcp_at(before))
         poses[:, :3, 3] += rise[:, None] * poses[:, :3, 2]
     return replace(candidates, Ts_canonical_grasp=poses, widths=widths)
 
@@ -152,7 +151,7 @@ def _near_walls(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
 
 
 def _between_fingers(cloud: PreparedCloud, poses: Tensor, near: Tensor, hand: Gripper) -> tuple[Tensor, Tensor, Tensor]:
-    """Candidates (K,), places y (K,) and components of normals along y (K,) of the points between the open fingers."""
+    """Candidates (K,), places y (K,) and components of normals along y (K,) of the points between the fingers."""
     half = hand.finger_breadth / 2 + _BESIDE
     x, y, z = points_in_grasp_frames(cloud.points, poses)
     inside = (x.abs_() <= half) & (z >= hand.palm_front) & (z <= hand.tip_offset)

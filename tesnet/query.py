@@ -155,7 +155,7 @@ class GraspQuery:
         _whole_in_range("max_candidates", self.max_candidates, 1, MAX_CANDIDATES)
         _whole_in_range("seed", self.seed, 0, MAX_SEED)
         _one_of("unseen", self.unseen, "free", "occupied")
-        _one_of("width", self.width, "fitted", "full", None)
+        _one_of("width", self.opening_policy, "fitted", "full")
         _one_of("calibrate", self.calibrate, True, False)
 
     @property

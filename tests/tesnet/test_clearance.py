@@ -20,7 +20,7 @@ def stop(
         *(torch.tensor([value], dtype=torch.float64) for value in (down, clearance, reach)),
         wanted=WANTED,
         error=error,
-        farthest=farthest,
+        farthest=torch.tensor([farthest], dtype=torch.float64),
     )
     return float(back), bool(too_near)
 

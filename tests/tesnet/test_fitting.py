@@ -1,16 +1,18 @@
 from __future__ import annotations
 
+from typing import Literal
+
 import numpy as np
 import pytest
 import torch
 
 from tesnet import fitting
-from tesnet.candidates import CandidateConfig, Candidates, clear_of_support, generate, hand_clearance
+from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support, generate, hand_clearance
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
 from tesnet.search import search
-from tests.tesnet.scenes import UP, Array, ask, prepared, tabletop_query
+from tests.tesnet.scenes import UP, Array, ask, bare_cloud, prepared, tabletop_query
 
 ABOVE = np.array([0.05, -0.1, 0.6])
 
@@ -156,18 +158,59 @@ def test_what_lies_between_the_fingers_is_what_each_pose_by_itself_has_there(nam
     assert seen > 900
 
 
-def test_a_hand_that_would_come_too_low_keeps_its_place_and_its_width() -> None:
-    """Any other is moved and told its width: each hand is wholly the one or wholly the other."""
-    query = tabletop_query(max_candidates=2000, gripper=HANDS["rg2"].gripper)
+@pytest.mark.parametrize("name", ["franka", "rg2", "robotiq_2f140"])
+@pytest.mark.parametrize("policy", ["fitted", "full"])
+def test_a_hand_too_low_midway_stops_short_or_keeps_its_place(name: str, policy: Literal["fitted", "full"]) -> None:
+    """Low things. Whatever was done: clear of the support, tips no less deep than the contact, as wide as was asked."""
+    hand, config, stayed = HANDS[name].gripper, CandidateConfig(centred=True), 0
+    for seed in range(3):
+        query = tabletop_query(seed, max_candidates=800, gripper=hand)
+        cloud = prepared(query)
+        found, _ = generate(cloud, query, CandidateConfig())
+        placed = fitting.fitted(cloud, found, config, policy=policy)
+        clearance = hand_clearance(cloud, placed)
+        assert float(clearance.min()) >= 0.0015 - 2e-5
+        rest = at_rest(cloud, placed).Ts_canonical_grasp
+        moved = placed.Ts_canonical_grasp - found.Ts_canonical_grasp
+        aside = (moved[:, :3, 3] * found.Ts_canonical_grasp[:, :3, 1]).sum(dim=1).abs() > 1e-6
+        past = ((rest[:, :3, 3] - cloud.points[placed.contact]) * rest[:, :3, 2]).sum(dim=1) + hand.tip_offset
+        assert float(past[aside].min()) >= -2e-5
+        assert float(past.max()) <= 0.007 + 2e-5
+        stayed += int((~aside).sum())
+        if policy == "full":
+            assert torch.equal(placed.widths, found.widths)
+        else:
+            assert float((placed.widths < hand.max_width).double().mean()) > 0.3
+    assert stayed > 0
+
+
+def test_a_hand_that_stays_where_it_is_opens_by_what_it_will_hold_all_the_same() -> None:
+    """Only where even that is too low it arrives wide open."""
+    hand, config = HANDS["rg2"].gripper, CandidateConfig(centred=True)
+    query = tabletop_query(1, max_candidates=2000, gripper=hand)
     cloud = prepared(query)
     found, _ = generate(cloud, query, CandidateConfig())
-    config = CandidateConfig(centred=True)
-    result = fitting.fitted(cloud, found, config, policy="fitted")
-    moved, stays = clear_of_support(cloud, fitting._moved(cloud, found, True, "fitted"), config)
-    assert 0 < int(stays.sum()) < len(found)
-    assert bool((hand_clearance(cloud, moved)[~stays] >= 0.0015 - 1e-5).all())
-    assert ((moved.widths - found.widths).abs()[stays] > 1e-4).any()
-    for name in ("Ts_canonical_grasp", "widths"):
-        told = getattr(result, name)
-        assert torch.equal(told[stays], getattr(found, name)[stays])
-        assert torch.equal(told[~stays], getattr(moved, name)[~stays])
+    placed = fitting.fitted(cloud, found, config, policy="fitted")
+    apart = (placed.Ts_canonical_grasp - found.Ts_canonical_grasp)[:, :3, 3]
+    in_place = (apart * found.Ts_canonical_grasp[:, :3, 1]).sum(dim=1).abs() < 1e-6
+    narrower = placed.widths < hand.max_width - 1e-6
+    assert int((in_place & narrower).sum()) > 0
+    _, low = clear_of_support(cloud, found, config)
+    assert not bool(low.any())
+
+
+@pytest.mark.parametrize("width", [0.104, 0.08, 0.07])
+def test_what_swinging_tips_will_hold_is_looked_for_where_they_rest(width: float) -> None:
+    """A block 50 mm wide between the tips at rest, 30 mm ahead of where the wide open RG2's are: however it arrives."""
+    hand = HANDS["rg2"].gripper
+    y, z = (axis.ravel() for axis in np.meshgrid(np.linspace(-0.025, 0.025, 26), np.linspace(-0.012, 0.012, 13)))
+    points = np.stack([np.zeros_like(y), y, z], axis=1)
+    cloud = bare_cloud(points, np.array([[0.0, 0.0, -0.6]]))
+    contact = int(np.flatnonzero((np.abs(y - 0.025) < 1e-9) & (np.abs(z) < 1e-9))[0])
+    pose = torch.eye(4)[None].clone()
+    pose[0, 2, 3] = -(hand.tcp_at(0.05) - hand.tcp_at(width))
+    pair = torch.tensor([0]), torch.tensor([contact])
+    candidate = Candidates(*pair, pose, torch.tensor([width]), hand)
+    placed = fitting.fitted(cloud, candidate, CandidateConfig(centred=True), policy="fitted")
+    assert float(placed.widths[0]) == pytest.approx(0.05 + 2 * 0.014, abs=0.004)
+    assert float(at_rest(cloud, placed).Ts_canonical_grasp[0, 2, 3]) == pytest.approx(0.0, abs=1e-6)

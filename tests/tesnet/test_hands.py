@@ -154,9 +154,7 @@ def test_the_clearance_holds_for_the_lowest_tip_on_the_way(name: str) -> None:
     for row, clearance in enumerate(candidates.hand_clearance(cloud, found).tolist()):
         T, width = Ts[row], widths[row]
         along = (cloud.points[contact[row]].double().numpy() - T[:3, 3]) @ T[:3, 1]
-        closed = np.clip(
-            min(2 * along, hand.max_width) - 0.01, 0, width
-        )  # 10 mm narrower than the walls, which may be elsewhere
+        closed = max(min(2 * along, width) - 0.01, 0.0)  # 10 mm narrower than the walls, which may be elsewhere
         lowest = np.inf
         for closing in np.linspace(width, closed, 200) if name in ARCS else [width]:
             advance = from_base(hand, closing) - from_base(hand, width)

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import dataclasses
 import functools
 from dataclasses import replace
 from typing import Any
@@ -288,3 +289,15 @@ def test_what_the_caller_does_not_know_is_zero(options: dict[str, Any], known: i
     assert (inputs[:, 4] == known).all()  # whether up is known
     assert (inputs[:, 5:] == 0).all()  # height and whether it is known
     assert bool((inputs[:, 3] == 0).all()) == (known == 0)
+
+
+@pytest.mark.parametrize("name", ["rg2", "robotiq_2f140"])
+def test_a_hand_that_swings_is_scored_as_one_that_slides_where_its_fingers_rest(name: str) -> None:
+    ready, found = example()
+    swings = HANDS[name].gripper
+    arrives = replace(found, gripper=swings, widths=torch.full((len(found),), 0.9 * swings.max_width))
+    rests = candidates.at_rest(ready, arrives)
+    slides = dataclasses.replace(swings, name=None, linkage_length=None, linkage_offset=0.0)
+    assert (rests.Ts_canonical_grasp - arrives.Ts_canonical_grasp).abs().max() > 0.01
+    assert torch.equal(score(arrives), score(replace(rests, gripper=slides)))
+    assert not torch.equal(score(arrives), score(replace(arrives, gripper=slides)))
