@@ -76,7 +76,7 @@ def blocked(
 def palm_blocked(
     points: Tensor, candidates: Candidates, least: Tensor, most: Tensor, rise: float, between: Callable[[], None]
 ) -> Tensor:
-    """Mask (C,) of hands whose palm meets a point on its way wherever they may yet be moved: no fitting clears them.
+    """Mask (C,) of hands whose palm meets a point on its way wherever they may yet be moved within these limits.
 
     A quick look at every sixth of the points; `blocked` finds the others.
 

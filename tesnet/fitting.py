@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from tesnet.candidates import TIP_BEYOND_CONTACT, CandidateConfig, Candidates, at_rest, clear_of_support
+from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
 from tesnet.points import points_in_grasp_frames
@@ -93,10 +93,11 @@ def reach_of_fitting(
 ) -> tuple[Tensor, Tensor, float]:
     """How far `fitted` moves each hand along its closing direction, least and most (C,); how far along its travel.
 
-    The least is zero or less. Along the travel the palm moves as the tips' swing and stopping short have it.
+    The least is zero or less. Of moves along the travel these are those of tips that swing; that hands may also stop
+    short, which clears the palm of hardly any, is left out: to look for the walls of all that it might costs a tenth.
     """
     near, hand = _near_walls(cloud, candidates), candidates.gripper
-    rise = 2 * hand.travel + (0.0 if cloud.support_height is None else TIP_BEYOND_CONTACT)
+    rise = 2 * hand.travel
     if not config.centred:
         return torch.zeros_like(near), torch.zeros_like(near), rise
     least = (near - (hand.max_width + _FARTHEST_UNSEEN) / 2).clamp(max=0.0)
