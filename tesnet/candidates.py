@@ -40,6 +40,7 @@ _UPWARD = 0.5
 _ROUNDING = 1e-5
 
 _CLOSING_STEPS = 8
+"""Into so many pieces the way of tips that swing is cut, which is then at most 0.3 mm off."""
 
 _CLOSES_FARTHER = 0.01
 """Fingers are taken to close this much farther, metres, than to the walls that they are expected to rest on."""
@@ -462,8 +463,7 @@ def hand_clearance(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     if hand.linkage_length is not None:  # tips that slide get no lower as they close
         closed = (resting_widths(cloud, candidates) - _CLOSES_FARTHER).clamp(min=0.0)
         on_the_way = [torch.lerp(widths, closed, step / _CLOSING_STEPS) for step in range(_CLOSING_STEPS + 1)]
-        farthest = torch.full_like(widths, 2 * hand.linkage_offset)
-        on_the_way.append(torch.minimum(torch.maximum(farthest, closed), widths))
+        on_the_way.append(closed.clamp(min=hand.farthest_width).minimum(widths))
     lowest = []
     for part in hand.parts:
         corners = torch.tensor(part.corners(0.0), dtype=poses.dtype, device=poses.device)
@@ -474,11 +474,15 @@ def hand_clearance(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     return poses[:, :3, 3] @ cloud.up - cloud.support_height + torch.stack(lowest).min(dim=0).values
 
 
+def contact_places(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
+    """(C,) metres from the hand's middle to its contact point, along the closing direction."""
+    poses = candidates.Ts_canonical_grasp
+    return ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
+
+
 def resting_widths(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     """(C,) metres: opening at which each hand rests on its contact point and on a wall as far from its middle."""
-    poses = candidates.Ts_canonical_grasp
-    along = ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
-    return torch.minimum(2 * along.clamp(min=0.0), candidates.widths)
+    return torch.minimum(2 * contact_places(cloud, candidates).clamp(min=0.0), candidates.widths)
 
 
 def at_rest(cloud: PreparedCloud, candidates: Candidates) -> Candidates:

@@ -13,7 +13,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
-from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support
+from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support, contact_places
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
 from tesnet.points import points_in_grasp_frames
@@ -76,12 +76,12 @@ def fitted(
     tips swing forward stands where they come to rest on the walls. One that would come too low midway stops short;
     where that does not help it stays where it is, as wide as the policy says if that is clear of the support.
     """
-    if len(candidates) == 0 or (policy == "full" and not config.centred):
+    ways = [midway for midway, asked in ((False, policy == "fitted"), (True, config.centred)) if asked]
+    if len(candidates) == 0 or not ways:
         return candidates
     span, placed = spans(cloud, at_rest(cloud, candidates)), candidates
-    ways = [False] if policy == "fitted" else []
-    for centred in [*ways, True] if config.centred else ways:  # the last that is clear of the support counts
-        moved, low = clear_of_support(cloud, _moved(candidates, span, centred, policy), config)
+    for midway in ways:  # the last that is clear of the support counts
+        moved, low = clear_of_support(cloud, _moved(candidates, span, midway, policy), config)
         poses, widths = moved.Ts_canonical_grasp, moved.widths
         poses = torch.where(low[:, None, None], placed.Ts_canonical_grasp, poses)
         placed = replace(placed, Ts_canonical_grasp=poses, widths=torch.where(low, placed.widths, widths))
@@ -96,7 +96,7 @@ def reach_of_fitting(
     The least is zero or less. Of moves along the travel these are those of tips that swing; that hands may also stop
     short, which clears the palm of hardly any, is left out: to look for the walls of all that it might costs a tenth.
     """
-    near, hand = _near_walls(cloud, candidates), candidates.gripper
+    near, hand = contact_places(cloud, candidates), candidates.gripper
     rise = 2 * hand.travel
     if not config.centred:
         return torch.zeros_like(near), torch.zeros_like(near), rise
@@ -104,10 +104,10 @@ def reach_of_fitting(
     return least, near.clamp(min=0.0), rise
 
 
-def _moved(candidates: Candidates, span: Span, centred: bool, policy: Literal["fitted", "full"]) -> Candidates:
+def _moved(candidates: Candidates, span: Span, midway: bool, policy: Literal["fitted", "full"]) -> Candidates:
     hand = candidates.gripper
     middle = (span.near + span.far) / 2
-    shift = middle if centred else torch.zeros_like(middle)
+    shift = middle if midway else torch.zeros_like(middle)
     extent = (span.near - span.far + 2 * (middle - shift).abs()).clamp(0.0, hand.max_width)
     widths = candidates.widths
     if policy == "fitted":
@@ -130,7 +130,7 @@ def spans(cloud: PreparedCloud, candidates: Candidates) -> Span:
     y = m + r n holds for the places y and the components n of the normals along the closing direction, with m its
     middle and r its radius, so the line through them tells where it ends. That counts where it is beyond what was seen.
     """
-    poses, hand, near = candidates.Ts_canonical_grasp, candidates.gripper, _near_walls(cloud, candidates)
+    poses, hand, near = candidates.Ts_canonical_grasp, candidates.gripper, contact_places(cloud, candidates)
     row, y, n = _between_fingers(cloud, poses, near, hand)
     end = _last_before_gap(row, near[row] - y, len(near), hand)
     own = near[row] - y <= end[row] + _BIN
@@ -143,12 +143,6 @@ def spans(cloud: PreparedCloud, candidates: Candidates) -> Span:
     goes_on = ~seen & (lean < -_TURNING) & guess.isfinite()
     beyond = torch.minimum(last, guess).clamp(min=last - _FARTHEST_UNSEEN)
     return Span(near, torch.where(goes_on, beyond, last), seen)
-
-
-def _near_walls(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
-    """(C,) places of the contact points along the closing direction from the hand's middle."""
-    poses = candidates.Ts_canonical_grasp
-    return ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
 
 
 def _between_fingers(cloud: PreparedCloud, poses: Tensor, near: Tensor, hand: Gripper) -> tuple[Tensor, Tensor, Tensor]:

@@ -19,9 +19,6 @@ WIDEST = 0.16
 PALM_OVERLAP = 0.004
 """Metres of the usable finger depth that the hand's body covers."""
 
-_CLOSING_STEPS = 8
-"""Into so many pieces the arc of a fingertip is cut, which is then at most 0.3 mm off."""
-
 _TAPERED = {
     "finger_thickness": "finger_tip_thickness",
     "finger_breadth": "finger_tip_breadth",
@@ -170,7 +167,12 @@ class Gripper:
     @property
     def travel(self) -> float:
         """Metres by which the tips advance along z at most as the open hand closes."""
-        return float(max(self.tcp_at(width) for width in self.closing(self.max_width)) - self.hand_to_tcp)
+        return float(self.tcp_at(self.farthest_width) - self.hand_to_tcp)
+
+    @property
+    def farthest_width(self) -> float:
+        """The opening at which tips that swing are farthest along z, metres."""
+        return min(max(2 * self.linkage_offset, 0.0), self.max_width)
 
     # Operations
 
@@ -187,16 +189,6 @@ class Gripper:
     def _rise(self, width: Any) -> Any:
         assert self.linkage_length is not None
         return (self.linkage_length**2 - (width / 2 - self.linkage_offset) ** 2) ** 0.5
-
-    def closing(self, width: float) -> list[float]:
-        """Openings on the way from `width` to closed at which the tips are taken to be, one after the other.
-
-        Where they slide there is one, as they advance no farther; where they swing, that of the farthest is among them.
-        """
-        if self.linkage_length is None:
-            return [width]
-        highest = min(max(2 * self.linkage_offset, 0.0), width)
-        return sorted({highest, *(width * step / _CLOSING_STEPS for step in range(_CLOSING_STEPS + 1))}, reverse=True)
 
     def T_grasp_hand(self, width: float) -> Pose:
         """Pose of the hand's base link in the grasp frame of the hand open by `width`."""

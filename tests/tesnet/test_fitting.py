@@ -7,7 +7,15 @@ import pytest
 import torch
 
 from tesnet import fitting
-from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support, generate, hand_clearance
+from tesnet.candidates import (
+    CandidateConfig,
+    Candidates,
+    at_rest,
+    clear_of_support,
+    contact_places,
+    generate,
+    hand_clearance,
+)
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
@@ -129,7 +137,7 @@ def test_what_lies_between_the_fingers_is_what_each_pose_by_itself_has_there(nam
     query = tabletop_query(max_candidates=40, gripper=hand)
     cloud = prepared(query)
     found, _ = generate(cloud, query, CandidateConfig())
-    near = fitting._near_walls(cloud, found)
+    near = contact_places(cloud, found)
     rows, y, n = (part.numpy() for part in fitting._between_fingers(cloud, found.Ts_canonical_grasp, near, hand))
     points, normals = cloud.points.double().numpy(), cloud.normals.double().numpy()
     seen = 0
