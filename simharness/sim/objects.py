@@ -12,6 +12,7 @@ with +z up. A built-in test set and its training set share no object.
 `pybullet-random-train`     `random_urdfs` 000-899
 `novel`, `flat`, `wide`     made by `simharness.sim.shapes`, of families that no training set holds
 `shapes-train`              made by `simharness.sim.shapes`, of other families
+`extremes-train`            likewise: thin things, wide ones, and those that can be held in few places
 ==========================  ====================================================================================
 """
 

@@ -14,7 +14,7 @@ VALIDATION = ("flat", "novel", "wide")
 
 
 def test_validation_families_are_in_no_training_set() -> None:
-    trained = set(SETS["shapes-train"].families) | set(procedural.FAMILIES)
+    trained = set(SETS["shapes-train"].families) | set(SETS["extremes-train"].families) | set(procedural.FAMILIES)
     for name in VALIDATION:
         assert not trained & set(SETS[name].families)
     novel = SETS["novel"]

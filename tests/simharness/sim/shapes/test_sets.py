@@ -22,6 +22,7 @@ from tests.simharness.sim.meshes import (
 VALIDATION = ("flat", "novel", "wide")
 
 SHAPES = {
+    "extremes-train": "b44940bb317964a8bfa2f8e7c1bff9ce963f5f8add2f7b87921cfee3da77cfa4",
     "flat": "a84d34ec9962dd4e1f405fbdeba9b4ff4eb7288ba343dd02b909aade362ea946",
     "novel": "f2cae092dad01637c439ce2b235add4c39b29fdf823b41569ce5710e0d244a82",
     "shapes-train": "fd77141c40341fe44ce3c594d91219f2084e9c0dd9d3e284aa96c8268e8805c2",
