@@ -1,7 +1,8 @@
 """`python -m simharness`: clear tables through the service and count.
 
 `replay` shows one attempt again, `failures` sorts failed attempts by cause, `robustness` repeats a run under worse
-sensing, `compare` with several networks, `paired` compares two runs scene by scene.
+sensing, `compare` with several networks, `paired` compares two runs scene by scene, `sizes` counts what one cleared by
+size.
 
 Exit codes: 0 the run is complete; 2 the command cannot be carried out; 3 the service or a worker failed in mid-run,
 what was done is kept; 130 and 143 stopped by Ctrl-C and by SIGTERM.
@@ -32,6 +33,7 @@ from simharness.flags_from_settings import (
     robustness_parser,
     run_parser,
     settings_of,
+    sizes_parser,
     trials_of,
 )
 from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
@@ -48,6 +50,7 @@ from simharness.report.paired import paired, paired_table
 from simharness.report.progress import Progress
 from simharness.report.report import package_versions, report, table
 from simharness.report.robustness import JSON_FILE, PLOT_FILE, TABLE_FILE, Study, conditions
+from simharness.report.sizes import sizes, sizes_table
 from simharness.sim.camera import check_sensing
 from simharness.sim.objects import ObjectModel, load_object_set
 
@@ -238,6 +241,13 @@ def _paired(options: argparse.Namespace) -> int:
     return 0
 
 
+def _sizes(options: argparse.Namespace) -> int:
+    folder = RunFolder(options.folder)
+    settings, _, _ = folder.read_run()
+    print(sizes_table(sizes(settings, _objects(settings), folder.read_rounds()), options.bins))
+    return 0
+
+
 def _failures(options: argparse.Namespace) -> int:
     folder = RunFolder(options.folder)
     settings, _, _ = folder.read_run()
@@ -265,6 +275,7 @@ _COMMANDS = (
     ("robustness", robustness_parser, _robustness),
     ("compare", compare_parser, _compare),
     ("paired", paired_parser, _paired),
+    ("sizes", sizes_parser, _sizes),
 )
 
 

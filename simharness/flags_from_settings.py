@@ -193,6 +193,17 @@ def paired_parser() -> argparse.ArgumentParser:
     return parser
 
 
+def sizes_parser() -> argparse.ArgumentParser:
+    """Of `sizes`."""
+    parser = argparse.ArgumentParser(
+        prog="python -m simharness sizes",
+        description="Tell how many of the things of each size a run on a made set cleared.",
+    )
+    parser.add_argument("folder", type=Path, metavar="DIR", help="the --out of a run")
+    parser.add_argument("--bins", type=_at_least(1), default=5, metavar="N", help="of size (default 5)")
+    return parser
+
+
 def replay_parser() -> argparse.ArgumentParser:
     """Of `replay`."""
     parser = argparse.ArgumentParser(

@@ -28,7 +28,7 @@ from simharness.sim.camera import PRESET_SENSOR, Observation, Stand, observe
 from simharness.sim.execute import Outcome, attempt
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel
-from simharness.sim.scene import make_scene, scales_for
+from simharness.sim.scene import Scene, make_scene, scales_for
 from simharness.sim.sensors.catalogue import SENSORS
 from simharness.sim.sensors.gaussian import DepthGaussian, GammaScale, PatchNoise
 from simharness.sim.sensors.sensor import Sensor
@@ -172,6 +172,20 @@ def camera_sensor(settings: RunSettings) -> Sensor:
     return sensor
 
 
+def round_scene(
+    world: World, settings: RunSettings, objects: Sequence[ObjectModel], seed: int, round_number: int
+) -> Scene:
+    """Makes the scene of a round in an empty world."""
+    return make_scene(
+        world,
+        settings.scene,
+        objects,
+        scene_rng(seed, round_number),
+        num_objects=OBJECTS_PER_ROUND,
+        scale_range=scales_for(settings.scene, settings.hand.gripper),
+    )
+
+
 def play_round(
     settings: RunSettings,
     objects: Sequence[ObjectModel],
@@ -197,14 +211,7 @@ def play_round(
         RunBroken: the planner failed.
     """
     with World() as world:
-        scene = make_scene(
-            world,
-            settings.scene,
-            objects,
-            scene_rng(seed, round_number),
-            num_objects=OBJECTS_PER_ROUND,
-            scale_range=scales_for(settings.scene, settings.hand.gripper),
-        )
+        scene = round_scene(world, settings, objects, seed, round_number)
         names = {placed.body_id: placed.name for placed in scene.placed}
         present = tuple(names[body] for body in world.objects)
         table = _Table(settings, world, names, seed, round_number, listener, segmentation=segmentation)
