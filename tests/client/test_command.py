@@ -15,9 +15,12 @@ import numpy as np
 import pytest
 
 from client.__main__ import main
+from client.request import Request, depth_request
 from service import schemas
+from tesnet.geometry import Pose
 from tests.client.conftest import Answering, Reset, ScriptedServer, answering
 from tests.client.test_cloud_file import ply
+from tests.client.test_request import as_sent
 
 Points = np.ndarray[Any, np.dtype[np.float32]]
 ROOT = Path(__file__).resolve().parents[2]
@@ -151,6 +154,67 @@ def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict
         model="tesnet",
     )
     assert server.received[0].headers["x-request-id"] == "r-9"
+
+
+@pytest.mark.parametrize(
+    ("flags", "asked"),
+    [
+        ("--support-height 0 --up 0 0 1", {"support_height": 0.0, "up": [0.0, 0.0, 1.0]}),
+        ("--pregrasp-distance 0", {"pregrasp_distance": 0.0}),
+        ("--min-score 0", {"min_score": 0.0}),
+        ("--seed 0", {"seed": 0}),
+        ("--max-grasps 0", {"max_grasps": 0}),
+        ("--num-approach-points 0", {"num_approach_points": 0}),
+        ("--max-candidates 0", {"max_candidates": 0}),
+        ("--min-separation 0 0", {"min_separation": {"translation": 0.0, "rotation_deg": 0.0}}),
+        ("--viewpoint 0 0 0", {"viewpoint": [0.0, 0.0, 0.0]}),
+        ("--approach 0 0 -1 0", {"approach": {"direction": [0.0, 0.0, -1.0], "max_angle_deg": 0.0}}),
+        ("--gripper tip_offset=0", {"gripper": {"tip_offset": 0.0}}),
+        ("--width full --unseen free --frame-convention panda", {}),
+    ],
+)
+def test_a_zero_and_a_default_that_are_given_are_sent(
+    server: ScriptedServer, cloud: str, found: dict[str, Any], flags: str, asked: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    assert main([cloud, "--url", server.url, *flags.split()]) == 0
+    query = parse_qs(urlsplit(server.received[0].target).query)
+    options = {name: json.loads(values[0]) for name, values in query.items()}
+    assert options == (asked or {"width": "full", "unseen": "free", "frame_convention": "panda"})
+
+
+@pytest.mark.parametrize("scale", ["0.001", "0.0005"])
+@pytest.mark.parametrize("stride", ["1", "2", "3"])
+def test_the_flags_of_a_depth_image_are_the_arguments_of_the_client(
+    server: ScriptedServer, tmp_path: Path, found: dict[str, Any], scale: str, stride: str
+) -> None:
+    rng = np.random.default_rng(int(stride))
+    depth, mask = rng.integers(1, 2000, (2, 9, 7)).astype(np.uint16)
+    np.save(tmp_path / "depth.npy", depth)
+    np.save(tmp_path / "mask.npy", mask)
+    pose = Pose.random(rng, reach=0.5).matrix.round(4)
+    server.script = [answering(found)]
+    words = f"--intrinsics 50 60 3.5 4.5 --mask {tmp_path / 'mask.npy'} --target-label 0 --depth-scale {scale}"
+    words += f" --stride {stride} --camera-pose {' '.join(map(str, pose.ravel()))}"
+    assert main([str(tmp_path / "depth.npy"), "--url", server.url, "--request-id", "r-9", *words.split()]) == 0
+    (received,) = server.received
+    assert received.headers["x-request-id"] == "r-9"
+    expected = depth_request(
+        (tmp_path / "depth.npy").read_bytes(),
+        {"fx": 50.0, "fy": 60.0, "cx": 3.5, "cy": 4.5},
+        {"target": {"label": 0}},
+        mask=(tmp_path / "mask.npy").read_bytes(),
+        T_cloud_camera=pose,
+        depth_scale=float(scale),
+        stride=int(stride),
+    )
+    sent, options = as_sent(
+        Request("POST", received.target, received.body, {"Content-Type": received.headers["content-type"]})
+    )
+    meant, meant_options = as_sent(expected)
+    assert options == meant_options == {"target": {"label": 0}}
+    np.testing.assert_array_equal(sent.points, meant.points)
+    np.testing.assert_array_equal(sent.mask, meant.mask)
 
 
 def test_flags_left_out_stay_the_service_s_defaults(server: ScriptedServer, cloud: str, found: dict[str, Any]) -> None:

@@ -2,6 +2,8 @@ from __future__ import annotations
 
 import socket
 import time
+from collections.abc import Callable
+from typing import Any
 
 import httpcore
 import httpx
@@ -113,3 +115,90 @@ def test_certificates_that_cannot_be_loaded_are_told_where_they_are_needed(monke
     with pytest.raises(InvalidArgument, match="SSL_CERT_FILE"):
         tls_context(ELSEWHERE, "https://10.0.0.1:3128")
     tls_context(ELSEWHERE, "http://10.0.0.1:3128")
+
+
+class _Slow(httpcore.NetworkStream):
+    """A stream and backend of which each call takes a quarter of a second, and that keeps what it was given."""
+
+    def __init__(self) -> None:
+        self.now = 100.0
+        self.given: list[tuple[float, float | None]] = []
+        self.written: list[bytes] = []
+
+    def _take(self, timeout: float | None) -> None:
+        self.given.append((self.now, timeout))
+        self.now += 0.25
+
+    def read(self, max_bytes: int, timeout: float | None = None) -> bytes:
+        self._take(timeout)
+        return b"x" * max_bytes
+
+    def write(self, buffer: bytes, timeout: float | None = None) -> None:
+        self._take(timeout)
+        self.written.append(buffer)
+
+    def start_tls(self, context: Any, server_hostname: str | None = None, timeout: float | None = None) -> Any:
+        self._take(timeout)
+        return self
+
+    def connect_tcp(self, host: str, port: int, timeout: float | None, *_: Any) -> Any:
+        self._take(timeout)
+        raise httpcore.ConnectError(f"{host} refused")
+
+    def close(self) -> None:
+        """Nothing to close."""
+
+
+@pytest.fixture
+def slow(monkeypatch: pytest.MonkeyPatch) -> _Slow:
+    made = _Slow()
+    monkeypatch.setattr(time, "monotonic", lambda: made.now)
+    monkeypatch.setattr(transport, "_addresses", lambda host, port: [f"10.0.0.{n}" for n in range(40)])
+    return made
+
+
+def _connect(slow: _Slow, timeout: float | None) -> None:
+    backend = transport._Backend()
+    backend._sockets = slow  # type: ignore[assignment]
+    backend.connect_tcp("robot.example", 8000, timeout)
+
+
+def _at_once(slow: _Slow, timeout: float | None) -> None:
+    transport._Stream(slow).write(b"y" * (40 * transport.PIECE), timeout)
+
+
+def _many_reads(slow: _Slow, timeout: float | None) -> None:
+    for _ in range(40):
+        transport._Stream(slow).read(7, timeout)
+
+
+def _many_handshakes(slow: _Slow, timeout: float | None) -> None:
+    for _ in range(40):
+        transport._Stream(slow).start_tls(tls_context(ELSEWHERE, None), "robot.example", timeout)
+
+
+@pytest.mark.parametrize(
+    ("step", "passed"),
+    [
+        (_connect, httpcore.ConnectTimeout),
+        (_at_once, httpcore.WriteTimeout),
+        (_many_reads, httpcore.ReadTimeout),
+        (_many_handshakes, httpcore.ConnectTimeout),
+    ],
+)
+def test_every_wait_gets_what_is_left_until_the_end_and_none_begins_after_it(
+    slow: _Slow, step: Callable[[_Slow, float | None], None], passed: type[httpcore.TimeoutException]
+) -> None:
+    with pytest.raises(passed, match="used up"):
+        step(slow, Deadline.at(102.0))
+    assert len(slow.given) == 8
+    assert all(timeout == 102.0 - began for began, timeout in slow.given)
+
+
+@pytest.mark.parametrize("size", [0, 1, transport.PIECE - 1, transport.PIECE, transport.PIECE + 1, 100_000])
+def test_pieces_are_the_whole_in_order(slow: _Slow, size: int) -> None:
+    whole = bytes(range(256)) * (size // 256 + 1)
+    transport._Stream(slow).write(whole[:size], 3.0)
+    assert b"".join(slow.written) == whole[:size]
+    assert all(0 < len(piece) <= transport.PIECE for piece in slow.written)
+    assert all(timeout == 3.0 for _, timeout in slow.given)
