@@ -22,8 +22,9 @@ from training import archive, viewing
 from training.__main__ import main
 from training.archive import _draw, pack, unpack
 from training.generate import GenerateConfig, generate
+from training.parts import keys_of
 from training.viewing import MoreViews
-from training.views import LabelledView, LabelsError, load_scene, scene_files
+from training.views import LabelledView, LabelsError, load_scene, save_scene, scene_files
 
 pytestmark = pytest.mark.sim
 
@@ -180,6 +181,54 @@ def test_parts_are_added_of_scenes_that_an_archive_lacks(labels: Path, tmp_path:
     assert len(list((tmp_path / "archive").glob("labels_*.npz"))) == account["scenes"] > 1
     assert pack([labels], tmp_path / "archive") == account
     assert pack([labels], tmp_path / "whole")["labels"] == account["labels"]
+
+
+def scenes_of_seeds(labels: Path, folder: Path, seeds: list[int]) -> Path:
+    """A folder with one scene of the labels under each of these seeds."""
+    folder.mkdir()
+    description, views = load_scene(next(path for path in scene_files([labels]) if load_scene(path)[1]))
+    for seed in seeds:
+        save_scene(folder / f"scene_{seed:07d}.npz", {**description, "seed": seed}, views)
+    return folder
+
+
+def test_a_new_part_comes_after_all_that_are_there_and_replaces_none(labels: Path, tmp_path: Path) -> None:
+    """Also where one in between was taken away, and scenes of the default seed 0 are known again."""
+    first, second, all_of_them = (
+        scenes_of_seeds(labels, tmp_path / name, seeds)
+        for name, seeds in (("first", [0, 1]), ("second", [2]), ("third", [0, 1, 2, 3]))
+    )
+    out = tmp_path / "archive"
+    pack([first], out)
+    pack([second], out)
+    (out / "labels_001.npz").rename(out / "labels_002.npz")
+    contents = {path: path.read_bytes() for path in out.iterdir()}
+    account = pack([all_of_them], out)
+    assert {path.name for path in out.iterdir()} == {"labels_000.npz", "labels_002.npz", "labels_003.npz"}
+    assert all(path.read_bytes() == content for path, content in contents.items())
+    assert {key[0] for key in keys_of(out / "labels_003.npz")} == {3}
+    assert account["scenes"] == 4
+    assert account["bytes"] == sum(path.stat().st_size for path in out.iterdir())
+    labelled = load_scene(scene_files([second])[0])[1]
+    assert account["labels"] == 4 * sum(len(view.outcomes) for view in labelled) == sum(account["outcomes"].values())
+
+
+def test_no_part_has_more_scenes_than_it_may(labels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(archive, "SCENES_PER_PART", 2)
+    folder, out = scenes_of_seeds(labels, tmp_path / "labels", list(range(5))), tmp_path / "archive"
+    assert pack([folder], out)["scenes"] == 5
+    assert [len(keys_of(out / f"labels_{part:03d}.npz")) for part in range(3)] == [2, 2, 1]
+    assert len(list(out.iterdir())) == 3
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 7, None])
+def test_so_many_scenes_are_drawn_from_all_parts(labels: Path, tmp_path: Path, count: int | None) -> None:
+    out = tmp_path / "archive"
+    for part in range(3):
+        pack([scenes_of_seeds(labels, tmp_path / f"labels{part}", [part])], out)
+    chosen = _draw(sorted(out.glob("*.npz")), count, 0)
+    assert len(chosen) == 3
+    assert chosen.sum() == (3 if count is None else min(count, 3))
 
 
 def test_an_archive_without_its_objects_is_refused(
