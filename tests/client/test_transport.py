@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import importlib.util
 import socket
 import time
 from collections.abc import Callable
@@ -202,3 +203,74 @@ def test_pieces_are_the_whole_in_order(slow: _Slow, size: int) -> None:
     assert b"".join(slow.written) == whole[:size]
     assert all(0 < len(piece) <= transport.PIECE for piece in slow.written)
     assert all(timeout == 3.0 for _, timeout in slow.given)
+
+
+@pytest.mark.parametrize("scheme", ["http", "https"])
+@pytest.mark.parametrize("credentials", [None, ("me", "s3cret")])
+def test_a_pool_goes_through_its_proxy_with_its_credentials_and_what_it_is_trusted_by(
+    scheme: str, credentials: tuple[str, str] | None
+) -> None:
+    context = tls_context(ELSEWHERE, None)
+    named = "" if credentials is None else f"{credentials[0]}:{credentials[1]}@"
+    pool = transport.DeadlineTransport(f"{scheme}://{named}10.0.0.1:3128", context)._pool
+    proxy = pool._proxy
+    assert proxy is not None
+    assert (proxy.url.scheme, proxy.url.host, proxy.url.port) == (scheme.encode(), b"10.0.0.1", 3128)
+    assert proxy.auth == (None if credentials is None else tuple(word.encode() for word in credentials))
+    assert proxy.ssl_context is (context if scheme == "https" else None)
+    assert pool._ssl_context is context
+    assert transport.DeadlineTransport(None, context)._pool._proxy is None
+
+
+@pytest.mark.parametrize(
+    ("raised", "meant"),
+    [
+        (httpcore.ReadTimeout, httpx.TimeoutException),
+        (httpcore.ConnectTimeout, httpx.TimeoutException),
+        (httpcore.PoolTimeout, httpx.TimeoutException),
+        (httpcore.ConnectError, httpx.NetworkError),
+        (httpcore.RemoteProtocolError, httpx.NetworkError),
+        (httpcore.ProxyError, httpx.NetworkError),
+    ],
+)
+def test_what_goes_wrong_below_is_told_as_httpx_tells_it(
+    raised: type[Exception], meant: type[Exception], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    def fail(_: Any) -> None:
+        raise raised("the reason")
+
+    opened = transport.DeadlineTransport(None, tls_context(ELSEWHERE, None))
+    monkeypatch.setattr(opened._pool, "handle_request", fail)
+    with pytest.raises(meant, match="the reason"):
+        opened.handle_request(httpx.Request("GET", ELSEWHERE))
+
+
+@pytest.mark.parametrize(
+    ("url", "proxy", "is_loaded"),
+    [
+        ("http://robot.example", None, False),
+        ("http://robot.example", "http://10.0.0.1", False),
+        ("http://robot.example", "https://10.0.0.1", True),
+        ("https://robot.example", None, True),
+        ("https://robot.example", "http://10.0.0.1", True),
+    ],
+)
+def test_what_is_trusted_is_loaded_where_something_is_encrypted(url: str, proxy: str | None, is_loaded: bool) -> None:
+    context = tls_context(httpx.URL(url), proxy)
+    assert bool(context.get_ca_certs()) == is_loaded
+    assert context.check_hostname
+
+
+def test_the_environments_proxy_follows_the_scheme_and_then_all(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setenv("http_proxy", "10.0.0.2:3128")
+    monkeypatch.setenv("https_proxy", "https://10.0.0.3:3128")
+    assert proxy_for(httpx.URL("http://robot.example"), None) == "http://10.0.0.2:3128"
+    assert proxy_for(httpx.URL("https://robot.example"), None) == "https://10.0.0.3:3128"
+    monkeypatch.delenv("https_proxy")
+    assert proxy_for(httpx.URL("https://robot.example"), None) is None
+    monkeypatch.setenv("all_proxy", "socks5://10.0.0.4")
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: None)
+    with pytest.raises(InvalidArgument, match="ALL_PROXY is a SOCKS proxy, which needs the package socksio"):
+        proxy_for(httpx.URL("https://robot.example"), None)
+    monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "socksio")
+    assert proxy_for(httpx.URL("https://robot.example"), None) == "socks5://10.0.0.4"
