@@ -206,6 +206,14 @@ def test_the_candidates_that_are_tried_are_of_each_kind_as_many_as_asked_for(
     liked = set(sorted(free.nonzero()[:, 0].tolist(), key=lambda row: -logits[row])[: -(-int(free.sum()) // 4)])
     if mines:
         assert len(liked & set(chosen.tolist())) >= min(len(liked), (30 - met) // 2)
+    if mines and colliding == 3:  # of the other half as many are liked as there are left
+        draws = [
+            generating._choose(view.cloud, view.candidates, free, config, np.random.default_rng(seed), network)
+            for seed in range(20)
+        ]
+        half = (30 - met) // 2
+        left = (30 - met - half) * (len(liked) - half) / (int(free.sum()) - half)
+        assert np.mean([len(liked & set(draw.tolist())) for draw in draws]) == pytest.approx(half + left, abs=1.0)
     alike = replace(config, colliding_share=None)
     draws = [
         generating._choose(view.cloud, view.candidates, free, alike, np.random.default_rng(seed), None)
@@ -258,3 +266,27 @@ def test_views_of_fewer_points_than_the_service_answers_have_no_labels(monkeypat
         description, views = generating.label_scene(config, sets, number, judge)
         assert [len(view.cloud) for view in views] == [size for size in sizes if size >= MINIMUM_POINTS]
         assert len(description["views"]) == len(views) < len(sizes) == 2
+
+
+@pytest.mark.parametrize("name", ["franka", "rg2"])
+def test_what_is_stored_of_a_candidate_is_how_it_was_tried(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pose and opening, which of hands whose tips swing is what they will hold; each with its own outcome."""
+    tried: list[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = []
+
+    def judged(world: Any, hand: Any, poses: Any, openings: Any, snapshot: int) -> list[str]:
+        assert hand.gripper == HANDS[name].gripper
+        tried.append((np.asarray(poses), np.asarray(openings)))
+        return [OUTCOME_KINDS[number % len(OUTCOME_KINDS)] for number in range(len(openings))]
+
+    monkeypatch.setattr(generating, "label_strict", judged)
+    config = replace(CONFIG, gripper=name, labels_per_view=30)
+    _, views = generating.label_scene(config, generating.object_sets(config), 0, generating.Judge.of(config))
+    assert len(views) == len(tried) > 0
+    for view, (poses, openings) in zip(views, tried, strict=True):
+        assert len(view.outcomes) == len(openings) > 0
+        np.testing.assert_allclose(view.widths.numpy(), openings, atol=1.1e-6)
+        stored = view.cloud.T_cloud_canonical.matrix @ view.poses.double().numpy()
+        np.testing.assert_allclose(stored, poses, atol=1e-6)
+        assert view.outcomes.tolist() == [number % len(OUTCOME_KINDS) for number in range(len(openings))]
+        is_narrow = openings < HANDS[name].gripper.max_width - 1e-6
+        assert is_narrow.any() == (name == "rg2")
