@@ -22,7 +22,7 @@ from training import archive, viewing
 from training.__main__ import main
 from training.archive import _draw, pack, unpack
 from training.generate import GenerateConfig, generate
-from training.parts import keys_of
+from training.parts import ArchivedView, keys_of
 from training.viewing import MoreViews
 from training.views import LabelledView, LabelsError, load_scene, save_scene, scene_files
 
@@ -276,3 +276,48 @@ def test_views_that_are_rendered_with_too_few_points_are_left_out_of_their_scene
         assert [len(view.outcomes) for view in views] == told
         kept.append(len(views))
     assert kept[0] == len(scene.views) > kept[-1]
+
+
+def test_a_new_camera_shows_the_candidates_of_whose_pair_it_sees_both_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near enough, that is; which of them are free of what it sees is judged anew."""
+    rng = np.random.default_rng(0)
+    view = labelled_view(count=60)
+    view = replace(view, collision_free=torch.zeros(60, dtype=torch.bool))
+    found = torch.stack([view.cloud.points[view.approach], view.cloud.points[view.contact]], dim=1).double().numpy()
+    distances = rng.choice([0.0, 0.0149, 0.0151, 0.04], (60, 2))
+    directions = np.stack([[Pose.random(rng).rotation[0] for _ in range(2)] for _ in range(60)])
+    wanted = view.cloud.T_cloud_canonical.apply(found + distances[:, :, None] * directions)
+    np.testing.assert_allclose(archive._shifts(view, wanted).numpy(), distances, atol=1e-5)
+    looked = viewing.Viewing((Pose.identity(),), "gaussian", 0)
+    halves = [
+        ArchivedView(
+            looked,
+            view.gripper,
+            wanted[some],
+            view.poses.numpy()[some],
+            view.widths.numpy()[some],
+            view.outcomes.numpy()[some],
+            view.collision_free.numpy()[some],
+        )
+        for some in (slice(20), slice(20, None))
+    ]
+    asked: list[ArchivedView] = []
+
+    def rendered(_: Any, everything: ArchivedView, __: Any) -> LabelledView:
+        asked.append(everything)
+        return view
+
+    monkeypatch.setattr(archive, "_render_view", rendered)
+    shown = archive._from_elsewhere(None, halves, looked, PreparationConfig())  # type: ignore[arg-type]
+    assert shown is not None
+    (everything,) = asked
+    np.testing.assert_array_equal(everything.places, wanted)
+    np.testing.assert_array_equal(everything.outcomes, view.outcomes.numpy())
+    near = (distances < 0.015).all(axis=1)
+    assert 5 < near.sum() < 40
+    assert torch.equal(shown.poses, view.poses[torch.from_numpy(near)])
+    assert torch.equal(shown.outcomes, view.outcomes[torch.from_numpy(near)])
+    assert torch.equal(shown.collision_free, ~blocked(shown.cloud, shown.candidates, "free"))
+    assert shown.collision_free.any()
+    monkeypatch.setattr(archive, "_render_view", lambda *_: None)
+    assert archive._from_elsewhere(None, halves, looked, PreparationConfig()) is None  # type: ignore[arg-type]

@@ -11,7 +11,7 @@ import torch
 
 from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
-from simharness.sim.scene import SCALE_RANGES, restore_scene, scales_for
+from simharness.sim.scene import SCALE_RANGES, make_scene, restore_scene, scales_for
 from simharness.sim.world import World
 from tesnet import networks, weights
 from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, PreparedCloud, prepare
@@ -290,3 +290,28 @@ def test_what_is_stored_of_a_candidate_is_how_it_was_tried(name: str, monkeypatc
         assert view.outcomes.tolist() == [number % len(OUTCOME_KINDS) for number in range(len(openings))]
         is_narrow = openings < HANDS[name].gripper.max_width - 1e-6
         assert is_narrow.any() == (name == "rg2")
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_a_scene_is_drawn_alike_whatever_hand_shall_take_its_things(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also how it is looked at; things are larger for a wider hand."""
+    states: list[list[Any]] = []
+
+    def noted(function: Any) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
+            rng = next(value for value in arguments if isinstance(value, np.random.Generator))
+            states[-1].append((rng.bit_generator.state, options.get("num_objects")))
+            return function(*arguments, **options)
+
+        return call
+
+    monkeypatch.setattr(generating, "make_scene", noted(make_scene))
+    monkeypatch.setattr(generating, "draw_viewing", noted(viewing.draw_viewing))
+    for gripper in ("franka", "random", "rg2"):
+        states.append([])
+        config = replace(CONFIG, gripper=gripper, views=2, labels_per_view=1)
+        generating.label_scene(config, generating.object_sets(config), number, generating.Judge.of(config))
+    assert len(states[0]) == 3
+    assert states[0] == states[1] == states[2]
