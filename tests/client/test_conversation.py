@@ -21,6 +21,7 @@ from client.conversation import (
     Wait,
     ask,
     await_ready,
+    look,
 )
 from client.reply import Answer, grasp_reply
 from client.request import Request
@@ -211,3 +212,34 @@ def test_a_conversation_is_what_its_rules_say_of_any_outcomes(
         assert step == Wait(wait)
         now += wait
         step = steps.send(None)
+
+
+@pytest.mark.parametrize(
+    ("outcome", "is_there"),
+    [
+        (Answer(200, {}, b""), True),
+        (Answer(204, {}, b""), False),
+        (Answer(503, {}, b""), False),
+        (ConnectionLost("gone"), False),
+        (TimedOut(), False),
+        (Unusable("odd", 200), False),
+    ],
+)
+def test_a_look_is_one_try_that_says_yes_to_a_200_alone(outcome: Outcome, is_there: bool) -> None:
+    steps = look("/health/live", timeout=3.0)
+    assert next(steps) == Send(Request("GET", "/health/live"), 3.0)
+    with pytest.raises(StopIteration) as ended:
+        steps.send(outcome)
+    assert ended.value.value is is_there
+
+
+@pytest.mark.parametrize(("status", "words"), [(503, "503 A title: A detail."), (502, "status 502 without a problem")])
+def test_waiting_in_vain_tells_the_words_of_the_service_or_of_a_proxy(
+    refusing: Refusing, status: int, words: str
+) -> None:
+    now = 0.0
+    steps = await_ready(timeout=0.3, clock=lambda: now)
+    next(steps)
+    now = 0.25
+    with pytest.raises(client.ServiceTimeout, match=f"not ready after 0.3 s: {words}"):
+        steps.send(Answer(status, {}, refusing(503).body if status == 503 else b"bad gateway"))

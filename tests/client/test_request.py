@@ -308,3 +308,28 @@ def test_a_request_id_goes_as_it_is_up_to_128_characters(name: str) -> None:
 @pytest.mark.parametrize("value", ["~", " ".join("ab"), "x" * 4000, "!"])
 def test_a_header_may_hold_what_is_printable_up_to_4000_characters(value: str) -> None:
     assert header_value("api_key", value) == value
+
+
+@pytest.mark.parametrize(
+    ("beside", "words"),
+    [
+        ({"normals": np.zeros((2, 2, 2))}, "normals: has shape .*give x, y, z for each of the 4 points"),
+        ({"normals": np.zeros((1, 2, 2, 3))}, "give x, y, z"),
+        ({"normals": np.zeros((4, 3), bool)}, "dtype bool; give x, y, z"),
+        ({"view_index": np.zeros((2, 3), int)}, "view_index: .*give a whole number for each of the 4 points"),
+        ({"view_index": np.zeros(4, bool)}, "give a whole number"),
+    ],
+)
+def test_what_belongs_to_each_point_says_what_it_should_be(beside: dict[str, Any], words: str) -> None:
+    for points in (np.zeros((4, 3)), np.zeros((2, 2, 3))):
+        with pytest.raises(InvalidArgument, match=words):
+            points_request(points, {}, **beside)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (2, 2, 3)])
+@pytest.mark.parametrize("kind", [int, float, np.float32, np.uint8])
+def test_normals_of_any_numbers_and_of_points_or_pixels_arrive(shape: tuple[int, ...], kind: type) -> None:
+    normals: np.ndarray[Any, Any] = (np.arange(12).reshape(shape) % 5).astype(kind)
+    payload, _ = as_sent(points_request(np.zeros(shape), {}, normals=normals))
+    assert payload.normals is not None
+    np.testing.assert_array_equal(payload.normals, normals.reshape(-1, 3))

@@ -3,6 +3,7 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import gzip
+import inspect
 import json
 import socket
 import threading
@@ -503,3 +504,17 @@ def test_the_transport_can_be_replaced(points: Points, found: dict[str, Any]) ->
     transport = httpx.MockTransport(lambda _: httpx.Response(200, json=found))
     with client.GraspClient("http://robot.invalid", transport=transport) as opened:
         assert len(opened.grasps(points)) == 3
+
+
+@pytest.mark.parametrize("kind", [client.GraspClient, client.AsyncGraspClient])
+def test_both_clients_have_the_defaults_that_they_tell(kind: type) -> None:
+    def defaults(method: Any) -> dict[str, Any]:
+        found = inspect.signature(method).parameters.values()
+        return {one.name: one.default for one in found if one.default is not inspect.Parameter.empty}
+
+    nothing = dict.fromkeys(("retry", "api_key", "headers", "proxy", "transport"))
+    assert defaults(kind) == {"timeout": 30.0, "max_answer_mb": 64.0, **nothing}
+    of_call = dict.fromkeys(("request_id", "timeout"))
+    assert defaults(getattr(kind, "grasps")) == {"view_index": None, "normals": None, **of_call}  # noqa: B009
+    of_image = {"mask": None, "T_cloud_camera": None, "depth_scale": 0.001, "stride": 1}
+    assert defaults(getattr(kind, "grasps_from_depth")) == {**of_image, **of_call}  # noqa: B009

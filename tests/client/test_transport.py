@@ -274,3 +274,9 @@ def test_the_environments_proxy_follows_the_scheme_and_then_all(monkeypatch: pyt
         proxy_for(httpx.URL("https://robot.example"), None)
     monkeypatch.setattr(importlib.util, "find_spec", lambda name: name == "socksio")
     assert proxy_for(httpx.URL("https://robot.example"), None) == "socks5://10.0.0.4"
+
+
+def test_the_connections_of_a_pool_keep_the_deadline_and_are_as_many_as_are_shared() -> None:
+    pool = transport.DeadlineTransport(None, tls_context(ELSEWHERE, None))._pool
+    assert isinstance(pool._network_backend, transport._Backend)
+    assert (pool._max_connections, pool._keepalive_expiry) == (100, 5.0)
