@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import ast
 from pathlib import Path
 
 import pytest
@@ -31,3 +32,25 @@ def test_every_module_has_a_test_file_of_its_name_or_of_its_package(package: str
         if not (own.exists() or of_its_package.exists() or elsewhere.exists()):
             without.append(module.as_posix())
     assert without == []
+
+
+CHANGE = {
+    "service/batching.py": {"_Running"},
+    "service/middleware.py": {"RequestRecord"},
+    "service/turns.py": {"Job"},
+    "simharness/play/crew.py": {"_Process"},
+    "tesnet/formats/ply.py": {"_Element"},
+    "training/fit.py": {"_Progress"},
+}
+"""What is noted as things go on; every other value stays as it was made."""
+
+
+def test_values_stay_as_they_were_made() -> None:
+    changing: dict[str, set[str]] = {}
+    for package in ("client", "service", "simharness", "tesnet", "training"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                made = [one for one in getattr(node, "decorator_list", []) if "dataclass" in ast.unparse(one)]
+                if made and "frozen=True" not in ast.unparse(made[0]) and isinstance(node, ast.ClassDef):
+                    changing.setdefault(path.relative_to(ROOT).as_posix(), set()).add(node.name)
+    assert changing == CHANGE

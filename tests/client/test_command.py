@@ -15,9 +15,12 @@ import numpy as np
 import pytest
 
 from client.__main__ import main
+from client.request import Request, depth_request
 from service import schemas
+from tesnet.geometry import Pose
 from tests.client.conftest import Answering, Reset, ScriptedServer, answering
 from tests.client.test_cloud_file import ply
+from tests.client.test_request import as_sent
 
 Points = np.ndarray[Any, np.dtype[np.float32]]
 ROOT = Path(__file__).resolve().parents[2]
@@ -151,6 +154,130 @@ def test_every_option_has_a_flag(server: ScriptedServer, cloud: str, found: dict
         model="tesnet",
     )
     assert server.received[0].headers["x-request-id"] == "r-9"
+
+
+@pytest.mark.parametrize(
+    ("flags", "asked"),
+    [
+        ("--support-height 0 --up 0 0 1", {"support_height": 0.0, "up": [0.0, 0.0, 1.0]}),
+        ("--pregrasp-distance 0", {"pregrasp_distance": 0.0}),
+        ("--min-score 0", {"min_score": 0.0}),
+        ("--seed 0", {"seed": 0}),
+        ("--max-grasps 0", {"max_grasps": 0}),
+        ("--num-approach-points 0", {"num_approach_points": 0}),
+        ("--max-candidates 0", {"max_candidates": 0}),
+        ("--min-separation 0 0", {"min_separation": {"translation": 0.0, "rotation_deg": 0.0}}),
+        ("--viewpoint 0 0 0", {"viewpoint": [0.0, 0.0, 0.0]}),
+        ("--approach 0 0 -1 0", {"approach": {"direction": [0.0, 0.0, -1.0], "max_angle_deg": 0.0}}),
+        ("--gripper tip_offset=0", {"gripper": {"tip_offset": 0.0}}),
+        ("--width full --unseen free --frame-convention panda", {}),
+    ],
+)
+def test_a_zero_and_a_default_that_are_given_are_sent(
+    server: ScriptedServer, cloud: str, found: dict[str, Any], flags: str, asked: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    assert main([cloud, "--url", server.url, *flags.split()]) == 0
+    query = parse_qs(urlsplit(server.received[0].target).query)
+    options = {name: json.loads(values[0]) for name, values in query.items()}
+    assert options == (asked or {"width": "full", "unseen": "free", "frame_convention": "panda"})
+
+
+@pytest.mark.parametrize("scale", ["0.001", "0.0005"])
+@pytest.mark.parametrize("stride", ["1", "2", "3"])
+def test_the_flags_of_a_depth_image_are_the_arguments_of_the_client(
+    server: ScriptedServer, tmp_path: Path, found: dict[str, Any], scale: str, stride: str
+) -> None:
+    rng = np.random.default_rng(int(stride))
+    depth, mask = rng.integers(1, 2000, (2, 9, 7)).astype(np.uint16)
+    np.save(tmp_path / "depth.npy", depth)
+    np.save(tmp_path / "mask.npy", mask)
+    pose = Pose.random(rng, reach=0.5).matrix.round(4)
+    server.script = [answering(found)]
+    words = f"--intrinsics 50 60 3.5 4.5 --mask {tmp_path / 'mask.npy'} --target-label 0 --depth-scale {scale}"
+    words += f" --stride {stride} --camera-pose {' '.join(map(str, pose.ravel()))}"
+    assert main([str(tmp_path / "depth.npy"), "--url", server.url, "--request-id", "r-9", *words.split()]) == 0
+    (received,) = server.received
+    assert received.headers["x-request-id"] == "r-9"
+    expected = depth_request(
+        (tmp_path / "depth.npy").read_bytes(),
+        {"fx": 50.0, "fy": 60.0, "cx": 3.5, "cy": 4.5},
+        {"target": {"label": 0}},
+        mask=(tmp_path / "mask.npy").read_bytes(),
+        T_cloud_camera=pose,
+        depth_scale=float(scale),
+        stride=int(stride),
+    )
+    sent, options = as_sent(
+        Request("POST", received.target, received.body, {"Content-Type": received.headers["content-type"]})
+    )
+    meant, meant_options = as_sent(expected)
+    assert options == meant_options == {"target": {"label": 0}}
+    np.testing.assert_array_equal(sent.points, meant.points)
+    np.testing.assert_array_equal(sent.mask, meant.mask)
+
+
+def test_the_time_the_key_and_the_id_are_those_that_were_given(
+    server: ScriptedServer, cloud: str, found: dict[str, Any], monkeypatch: pytest.MonkeyPatch
+) -> None:
+    server.script = [answering(found)]
+    monkeypatch.delenv("GRASP_API_KEY", raising=False)
+    assert main([cloud, "--url", server.url]) == 0
+    monkeypatch.setenv("GRASP_API_KEY", "s3cret")
+    assert main([cloud, "--url", server.url, "--timeout", "500", "--request-id", "r-9"]) == 0
+    plain, told = (received.headers for received in server.received)
+    assert 20 < float(plain["x-request-timeout"]) < 30
+    assert 400 < float(told["x-request-timeout"]) < 500
+    assert "x-api-key" not in plain
+    assert (told["x-api-key"], told["x-request-id"]) == ("s3cret", "r-9")
+
+
+NORMALS = np.eye(3)[np.arange(200) % 3]
+
+
+@pytest.mark.parametrize("of_file", [False, True])
+@pytest.mark.parametrize("given", [False, True])
+def test_normals_are_those_that_are_given_or_else_those_of_the_file(
+    server: ScriptedServer, tmp_path: Path, points: Points, found: dict[str, Any], of_file: bool, given: bool
+) -> None:
+    server.script = [answering(found)]
+    columns = np.column_stack([points, NORMALS]) if of_file else points
+    names = ("x", "y", "z", "nx", "ny", "nz")[: columns.shape[1]]
+    lines = ["ply", "format ascii 1.0", f"element vertex {len(points)}", *(f"property float {name}" for name in names)]
+    rows = [" ".join(map(repr, row)) for row in columns.astype(float).tolist()]
+    (tmp_path / "cloud.ply").write_text("\n".join([*lines, "end_header", *rows, ""]))
+    np.save(tmp_path / "normals.npy", -NORMALS)
+    np.save(tmp_path / "views.npy", np.arange(200) % 2)
+    flags = ["--normals", str(tmp_path / "normals.npy")] if given else []
+    flags += ["--view-index", str(tmp_path / "views.npy"), "--viewpoint", "0", "0", "1", "--viewpoint", "1", "0", "1"]
+    assert main([str(tmp_path / "cloud.ply"), "--url", server.url, *flags]) == 0
+    (received,) = server.received
+    sent, options = as_sent(
+        Request("POST", received.target, received.body, {"Content-Type": received.headers["content-type"]})
+    )
+    assert options == {"viewpoint": [[0.0, 0.0, 1.0], [1.0, 0.0, 1.0]]}
+    assert sent.view_index is not None
+    assert sent.view_index.tolist() == [0, 1] * 100
+    if given or of_file:
+        assert sent.normals is not None
+        np.testing.assert_array_equal(sent.normals, -NORMALS if given else NORMALS)
+    else:
+        assert sent.normals is None
+
+
+@pytest.mark.parametrize("asked", [False, True])
+def test_the_viewpoint_of_a_file_is_taken_and_told_unless_another_is_asked_for(
+    server: ScriptedServer, tmp_path: Path, found: dict[str, Any], capsys: pytest.CaptureFixture[str], asked: bool
+) -> None:
+    server.script = [answering(found)]
+    head = "FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 2\nHEIGHT 1\nVIEWPOINT 0.5 -0.25 2 1 0 0 0\nDATA ascii\n"
+    (tmp_path / "cloud.pcd").write_text(head + "1 2 3\n4 5 6\n")
+    flags = ["--viewpoint", "0", "0", "1"] if asked else []
+    assert main([str(tmp_path / "cloud.pcd"), "--url", server.url, *flags]) == 0
+    options = parse_qs(urlsplit(server.received[0].target).query)
+    assert json.loads(options["viewpoint"][0]) == ([0.0, 0.0, 1.0] if asked else [0.5, -0.25, 2.0])
+    said = "0.5 -0.25 2 of the file is ignored" if asked else "viewpoint is that of the file: 0.5 -0.25 2"
+    assert said in capsys.readouterr().err
 
 
 def test_flags_left_out_stay_the_service_s_defaults(server: ScriptedServer, cloud: str, found: dict[str, Any]) -> None:

@@ -137,3 +137,31 @@ def test_options_that_outgrow_a_url_travel_in_a_form() -> None:
     np.testing.assert_array_equal(payload.points, points)
     assert json.loads(payload.options["target"]) == {"indices": indices.tolist()}
     assert points_request(points, {"target": {"indices": [1, 2]}}).target.startswith("/grasps?target=")
+
+
+@pytest.mark.parametrize("largest", [0, 1, 254, 255, 256, 257, 65_534, 65_535])
+@pytest.mark.parametrize("dtype", [np.int64, np.uint16, np.int32])
+def test_a_label_never_becomes_another_wherever_the_image_gets_wider(largest: int, dtype: type) -> None:
+    labels: NDArray[Any] = np.array([[largest, 0], [largest // 2, max(largest - 1, 0)]]).astype(dtype)
+    levels = mask_levels(labels, (2, 2))
+    assert levels.tolist() == labels.tolist()
+    assert levels.dtype == (np.uint8 if largest <= 255 else np.uint16)
+
+
+@settings(max_examples=60)
+@given(npst.arrays(np.int64, shapes, elements=st.integers(0, 65_535)), st.sampled_from([1.0, 0.001, 0.00025, 1e-5]))
+def test_metres_and_counts_of_one_image_are_one(counts: NDArray[np.int64], scale: float) -> None:
+    """Also where metres lie up to almost half a count beside."""
+    shift = np.where(counts > 0, np.linspace(-0.49, 0.49, counts.size).reshape(counts.shape), 0.0)
+    np.testing.assert_array_equal(depth_counts(counts, scale), counts)
+    np.testing.assert_array_equal(depth_counts((counts + np.where(counts < 65_535, shift, 0)) * scale, scale), counts)
+
+
+@pytest.mark.parametrize(("scale", "fits"), [(1e-9, True), (1.0, True), (1.001, False), (0.0, False), (-1.0, False)])
+def test_a_scale_is_at_most_a_metre_per_count(scale: float, fits: bool) -> None:
+    counts = np.array([[65_535, 0]])
+    if fits:
+        assert depth_counts(counts, scale).tolist() == counts.tolist()
+    else:
+        with pytest.raises(InvalidArgument, match="depth_scale"):
+            depth_counts(counts, scale)

@@ -186,6 +186,35 @@ def test_a_proxy_that_refuses_in_its_own_words_is_the_same_kind_of_problem(statu
     assert error.retry_after == 3
 
 
+@pytest.mark.parametrize(("status", "phrase"), [(401, "Unauthorized"), (429, "Too Many Requests")])
+@pytest.mark.parametrize("request_id", [None, "mine"])
+@pytest.mark.parametrize("retry_after", [None, "3"])
+def test_what_a_proxy_says_is_told_with_what_its_headers_say(
+    status: int, phrase: str, request_id: str | None, retry_after: str | None
+) -> None:
+    given = {"x-request-id": request_id, "retry-after": retry_after}
+    error = problem(Answer(status, {name: value for name, value in given.items() if value}, b"no"))
+    assert isinstance(error, client.ProblemError)
+    assert (error.status, error.title, error.request_id, dict(error.problem)) == (status, phrase, request_id, {})
+    assert error.retry_after == (None if retry_after is None else 3.0)
+
+
+def test_a_problem_of_the_service_is_told_by_its_document(refusing: Callable[..., Answering]) -> None:
+    """Its own id, whatever a header says."""
+    wire = refusing(429)
+    error = problem(Answer(429, {"x-request-id": "of-a-proxy", "retry-after": " 7 "}, wire.body))
+    assert isinstance(error, client.Overloaded)
+    assert (error.request_id, error.retry_after) == ("r-1", 7.0)
+
+
+@pytest.mark.parametrize("kind", [None, "text/html"])
+def test_another_answer_is_told_by_its_status_type_and_size(kind: str | None) -> None:
+    error = problem(Answer(418, {} if kind is None else {"content-type": kind}, b"short and stout"))
+    assert f"(status 418, {kind or 'no content type'}, 15 bytes)" in str(error)
+    assert isinstance(error, client.UnexpectedResponse)
+    assert error.status == 418
+
+
 @pytest.mark.parametrize("status", [204, 301, 404, 418])
 def test_any_other_foreign_answer_is_unexpected(status: int) -> None:
     error = problem(Answer(status, {}, b"<html>no</html>"))
@@ -236,3 +265,22 @@ def test_a_date_to_retry_after_is_that_of_greenwich_wherever_the_client_runs(
     assert isinstance(error, client.Overloaded)
     assert error.retry_after is not None
     assert 3000 < error.retry_after <= 3600
+
+
+def test_no_array_of_a_reply_can_be_changed(found: dict[str, Any]) -> None:
+    reply = grasp_reply(_answer(found))
+    names = ("scores", "poses", "hand_poses", "pregrasps", "widths", "approach_points", "contact_points")
+    arrays = [getattr(reply, name) for name in names]
+    for grasp in reply.grasps:
+        arrays += [grasp.approach_point, grasp.contact_point, grasp.position, grasp.pose.rotation]
+    for array in arrays:
+        assert not array.flags.writeable
+
+
+def test_the_hand_of_a_reply_has_every_size_that_was_told(found: dict[str, Any]) -> None:
+    for name, known in HANDS.items():
+        told: dict[str, Any] = {"name": name, **known.gripper.sizes(), "parts": []}
+        hand = grasp_reply(_answer({**found, "gripper": told})).gripper
+        assert hand is not None
+        assert hand.sizes() == pytest.approx(known.gripper.sizes())
+        assert hand.name == name

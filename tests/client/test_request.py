@@ -26,6 +26,7 @@ from client.request import (
 from service import schemas
 from service.payloads import Payload, decoder_for
 from tesnet.geometry import CameraIntrinsics, Pose
+from tesnet.query import FAR
 
 CLOUD = np.zeros((2, 3), dtype=np.float32)
 EVERY_OPTION: dict[str, Any] = {
@@ -226,6 +227,46 @@ def test_the_service_sees_a_depth_image_as_the_caller_described_it(stride: int, 
     np.testing.assert_allclose(payload.viewpoint, np.zeros(3) if pose is None else pose.translation, atol=1e-9)
 
 
+@pytest.mark.parametrize("decimals", [3, 4, 6])
+def test_a_camera_s_pose_as_it_is_printed_is_the_pose_that_was_meant(decimals: int) -> None:
+    """Its columns are of unit length and at right angles only as far as its decimals go."""
+    for seed in range(20):
+        pose = Pose.random(np.random.default_rng(seed), reach=0.5)
+        printed = pose.matrix.round(decimals)
+        camera: Intrinsics = {"fx": 50.0, "fy": 50.0, "cx": 1.0, "cy": 1.0}
+        for given_as in (printed, printed.tolist()):
+            arrived = as_sent(depth_request(np.ones((4, 4)), camera, {}, T_cloud_camera=given_as))[0]
+            expected = as_sent(depth_request(np.ones((4, 4)), camera, {}, T_cloud_camera=pose))[0]
+            np.testing.assert_allclose(arrived.points, expected.points, atol=4 * 10.0**-decimals)
+            assert arrived.viewpoint is not None
+            np.testing.assert_allclose(arrived.viewpoint, printed[:3, 3], atol=1e-9)
+
+
+@pytest.mark.parametrize(
+    "wrong",
+    [
+        np.diag([1.0, 1.0, -1.0, 1.0]),
+        np.diag([1.02, 1.02, 1.02, 1.0]),
+        np.eye(4)[[1, 0, 2, 3]],
+        np.zeros((4, 4)),
+        np.eye(3),
+    ],
+)
+def test_a_matrix_that_is_no_pose_is_refused_by_name(wrong: np.ndarray[Any, Any]) -> None:
+    with pytest.raises(InvalidArgument, match="T_cloud_camera"):
+        depth_request(np.ones((4, 4)), {"fx": 50, "fy": 50, "cx": 1, "cy": 1}, {}, T_cloud_camera=wrong)
+
+
+def test_coordinates_travel_as_float64_from_where_float32_would_blur_them_on_either_side() -> None:
+    for sign in (1, -1):
+        for size, content_type in ((0.99, "application/octet-stream"), (1.0, "application/x-npy")):
+            for column in range(3):
+                points = np.zeros((2, 3))
+                points[1, column] = sign * size * FAR
+                assert points_request(points, {}).headers["Content-Type"] == content_type
+                assert checked_points(points).dtype == (np.float64 if size == 1.0 else np.float32)
+
+
 def test_options_that_are_absent_or_none_are_left_to_the_service() -> None:
     assert _query({"up": None, "max_grasps": 3}) == {"max_grasps": 3}
     assert points_request(CLOUD, {"up": None}).target == "/grasps"
@@ -248,3 +289,47 @@ def test_a_header_cannot_be_smuggled(value: str) -> None:
         header_value("request_id", value)
     with pytest.raises(InvalidArgument, match="request_id"):
         points_request(CLOUD, {}, request_id=value)
+
+
+@pytest.mark.parametrize("name", ["a", "x" * 128, "robot-7/cell:3", "aZ09._:/+=-"])
+def test_a_request_id_goes_as_it_is_up_to_128_characters(name: str) -> None:
+    for request in (
+        points_request(CLOUD, {}, request_id=name),
+        points_request(CLOUD, {}, request_id=name, normals=np.eye(2, 3)),
+        depth_request(np.ones((2, 2)), {"fx": 50, "fy": 50, "cx": 1, "cy": 1}, {}, request_id=name),
+    ):
+        assert request.headers["X-Request-ID"] == name
+        assert request.headers["Accept"] == "application/json"
+    for wrong in (name + " ", name + "x" * 128, "\n" + name):
+        with pytest.raises(InvalidArgument, match="request_id"):
+            points_request(CLOUD, {}, request_id=wrong)
+
+
+@pytest.mark.parametrize("value", ["~", " ".join("ab"), "x" * 4000, "!"])
+def test_a_header_may_hold_what_is_printable_up_to_4000_characters(value: str) -> None:
+    assert header_value("api_key", value) == value
+
+
+@pytest.mark.parametrize(
+    ("beside", "words"),
+    [
+        ({"normals": np.zeros((2, 2, 2))}, "normals: has shape .*give x, y, z for each of the 4 points"),
+        ({"normals": np.zeros((1, 2, 2, 3))}, "give x, y, z"),
+        ({"normals": np.zeros((4, 3), bool)}, "dtype bool; give x, y, z"),
+        ({"view_index": np.zeros((2, 3), int)}, "view_index: .*give a whole number for each of the 4 points"),
+        ({"view_index": np.zeros(4, bool)}, "give a whole number"),
+    ],
+)
+def test_what_belongs_to_each_point_says_what_it_should_be(beside: dict[str, Any], words: str) -> None:
+    for points in (np.zeros((4, 3)), np.zeros((2, 2, 3))):
+        with pytest.raises(InvalidArgument, match=words):
+            points_request(points, {}, **beside)
+
+
+@pytest.mark.parametrize("shape", [(4, 3), (2, 2, 3)])
+@pytest.mark.parametrize("kind", [int, float, np.float32, np.uint8])
+def test_normals_of_any_numbers_and_of_points_or_pixels_arrive(shape: tuple[int, ...], kind: type) -> None:
+    normals: np.ndarray[Any, Any] = (np.arange(12).reshape(shape) % 5).astype(kind)
+    payload, _ = as_sent(points_request(np.zeros(shape), {}, normals=normals))
+    assert payload.normals is not None
+    np.testing.assert_array_equal(payload.normals, normals.reshape(-1, 3))

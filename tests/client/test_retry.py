@@ -49,3 +49,27 @@ def test_an_impossible_policy_is_refused() -> None:
         RetryPolicy(max_retries=-1)
     with pytest.raises(InvalidArgument, match="first_delay: is 10 s"):
         RetryPolicy(first_delay=10, max_delay=1)
+
+
+@pytest.mark.parametrize("jitter", [0.0, 0.25, 0.5, 0.999])
+def test_clients_that_failed_together_come_back_apart(jitter: float) -> None:
+    """Over the upper half of the wait, and over a first delay beyond what the service asks for."""
+    policy = RetryPolicy(max_retries=9, first_delay=0.2, max_delay=1.0)
+    for retries, whole in enumerate((0.2, 0.4, 0.8, 1.0, 1.0)):
+        assert policy.delay(retries, 100, jitter) == pytest.approx(whole / 2 + jitter * whole / 2)
+        assert policy.delay(retries, 100, jitter, 7.0) == pytest.approx(7.0 + 0.2 * jitter)
+
+
+def test_the_defaults_and_the_limits_of_a_policy() -> None:
+    assert RetryPolicy() == RetryPolicy(max_retries=2, first_delay=0.1, max_delay=5.0)
+    RetryPolicy(max_retries=0, first_delay=5.0)
+    for first_delay in (0.0, -0.1, 5.001):
+        with pytest.raises(InvalidArgument, match="first_delay"):
+            RetryPolicy(first_delay=first_delay)
+
+
+@given(st.floats(0.01, 50), st.floats(0, 20), JITTER)
+def test_a_wait_that_would_end_with_the_time_is_not_begun(remaining: float, retry_after: float, jitter: float) -> None:
+    wait = RetryPolicy().delay(0, remaining, jitter, retry_after)
+    meant = retry_after + 0.1 * jitter
+    assert wait == (meant if meant < remaining else None)

@@ -3,12 +3,14 @@ from __future__ import annotations
 import asyncio
 import dataclasses
 import gzip
+import inspect
 import json
 import socket
 import threading
 import time
 import zlib
-from collections.abc import Callable
+from collections.abc import Callable, Iterator
+from types import SimpleNamespace
 from typing import Any
 from urllib.parse import parse_qs, urlsplit
 
@@ -17,6 +19,7 @@ import numpy as np
 import pytest
 
 import client
+from client import session
 from client.request import depth_request
 from service.payloads import decoder_for
 from service.schemas import MAX_TIMEOUT_S
@@ -448,7 +451,70 @@ def test_one_async_client_serves_many_requests_at_once(
     assert len({received.target for received in server.received}) == 8
 
 
+def test_an_answer_that_drips_through_another_transport_ends_with_the_time_too(
+    found: dict[str, Any], points: Points, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Which keeps no time of its own, as one for tests."""
+    now = 50.0
+    monkeypatch.setattr(session, "time", SimpleNamespace(monotonic=lambda: now, sleep=time.sleep))
+    body = json.dumps(found).encode()
+
+    class Dripping(httpx.SyncByteStream):
+        def __iter__(self) -> Iterator[bytes]:
+            nonlocal now
+            for byte in body:
+                now += 0.01
+                yield bytes([byte])
+
+    transport = httpx.MockTransport(lambda _: httpx.Response(200, stream=Dripping()))
+    for seconds, arrives in ((0.01 * len(body) + 1, True), (0.01 * len(body) - 1, False)):
+        with client.GraspClient("http://robot.invalid", transport=transport) as opened:
+            if arrives:
+                assert len(opened.grasps(points, timeout=seconds)) == 3
+            else:
+                with pytest.raises(client.ServiceTimeout):
+                    opened.grasps(points, timeout=seconds)
+
+
+def test_the_clients_own_time_is_that_of_a_call_without_one(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    call(server.url, "grasps", points, client={"timeout": 300.0})
+    call(server.url, "grasps", points, client={"timeout": 300.0}, timeout=100.0)
+    told = [float(received.headers["x-request-timeout"]) for received in server.received]
+    assert 200 < told[0] < 300
+    assert 50 < told[1] < 100
+
+
+@pytest.mark.parametrize("size", [0.5, 1.0, 1.5])
+def test_an_answer_may_be_of_so_many_megabytes_and_no_byte_more(
+    call: Call, server: ScriptedServer, size: float
+) -> None:
+    whole = json.dumps(model_document()).encode()
+    limit = int(size * 2**20)
+    server.script = [Answering(200, whole + b" " * (limit - len(whole)), {"Content-Type": "application/json"})]
+    assert call(server.url, "model", client={"max_answer_mb": size}).to_dict() == model_document()
+    server.script = [Answering(200, whole + b" " * (limit + 1 - len(whole)), {"Content-Type": "application/json"})]
+    with pytest.raises(client.UnexpectedResponse, match=f"over {size:g} MB"):
+        call(server.url, "model", client={"max_answer_mb": size})
+
+
 def test_the_transport_can_be_replaced(points: Points, found: dict[str, Any]) -> None:
     transport = httpx.MockTransport(lambda _: httpx.Response(200, json=found))
     with client.GraspClient("http://robot.invalid", transport=transport) as opened:
         assert len(opened.grasps(points)) == 3
+
+
+@pytest.mark.parametrize("kind", [client.GraspClient, client.AsyncGraspClient])
+def test_both_clients_have_the_defaults_that_they_tell(kind: type) -> None:
+    def defaults(method: Any) -> dict[str, Any]:
+        found = inspect.signature(method).parameters.values()
+        return {one.name: one.default for one in found if one.default is not inspect.Parameter.empty}
+
+    nothing = dict.fromkeys(("retry", "api_key", "headers", "proxy", "transport"))
+    assert defaults(kind) == {"timeout": 30.0, "max_answer_mb": 64.0, **nothing}
+    of_call = dict.fromkeys(("request_id", "timeout"))
+    assert defaults(getattr(kind, "grasps")) == {"view_index": None, "normals": None, **of_call}  # noqa: B009
+    of_image = {"mask": None, "T_cloud_camera": None, "depth_scale": 0.001, "stride": 1}
+    assert defaults(getattr(kind, "grasps_from_depth")) == {**of_image, **of_call}  # noqa: B009

@@ -484,3 +484,28 @@ def test_a_predictor_that_cannot_be_made_is_reported_and_nothing_is_taken(query:
     with pytest.raises(NotReady, match="failed"):
         worker.submit(query)
     worker.stop()
+
+
+def test_several_that_interrupt_one_are_all_waited_for_and_not_learnt(timed: tuple[Timed, PredictionWorker]) -> None:
+    predictor, worker = timed
+    for _ in range(4):
+        expensive = worker.submit(cloud_of(4000))
+        assert predictor.entered.acquire(timeout=PATIENCE_S)
+        cheap = [worker.submit(cloud_of(1000)) for _ in range(2)]
+        began = predictor.now
+        for _ in range(3):
+            predictor.gate.release()
+        for job in (expensive, *cheap):
+            job.future.result(PATIENCE_S)
+        assert predictor.now == began + 4 + 2
+        for _ in range(2):
+            assert predictor.entered.acquire(timeout=PATIENCE_S)
+    worker.submit(cloud_of(4000))
+    assert worker.expected_wait == pytest.approx(4)
+
+
+@pytest.mark.parametrize(
+    ("seconds", "told"), [(0.0, 1), (0.2, 1), (1.0, 1), (1.01, 2), (59.0, 59), (59.5, 60), (60.5, 60), (1e6, 60)]
+)
+def test_a_wait_is_told_in_whole_seconds_from_one_to_a_minute(seconds: float, told: int) -> None:
+    assert batching._whole_seconds(seconds) == told

@@ -28,11 +28,11 @@ from service.payloads import (
 )
 from service.payloads.json_body import decode_json
 from service.payloads.options import unknown_option
-from service.payloads.payload import cloud_payload
+from service.payloads.payload import cloud_payload, kept, most_rows
 from service.payloads.per_point import known_normals
 from tesnet.errors import TesnetError, TooManyPoints
 from tesnet.geometry import Box, Gripper, Pose
-from tesnet.query import GraspQuery
+from tesnet.query import FAR, GraspQuery
 
 coordinates = st.floats(-10, 10, width=32) | st.integers(-10, 10)
 clouds = st.lists(st.tuples(coordinates, coordinates, coordinates), max_size=40)
@@ -388,6 +388,46 @@ def test_a_depth_image_gives_the_points_of_a_loop_over_its_pixels(kind: type[np.
     assert payload.is_point.tolist() == of_pixel.tolist()
     assert payload.viewpoint is not None
     np.testing.assert_allclose(payload.viewpoint, pose.translation, atol=1e-9)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("column", range(3))
+@pytest.mark.parametrize(("size", "is_far"), [(0.0, False), (0.999, False), (1.0, True), (50.0, True)])
+def test_coordinates_stay_precise_from_where_float32_would_blur_them_on_either_side(
+    sign: int, column: int, size: float, is_far: bool
+) -> None:
+    rows = np.full((3, 3), 0.1)
+    rows[1, column] = sign * size * FAR + 1e-4 * (not is_far)
+    for array in (rows, rows.astype(">f8"), np.asfortranarray(rows)):
+        points = kept(array)
+        assert points.dtype == (np.float64 if is_far else np.float32)
+        assert points.flags.c_contiguous
+        np.testing.assert_array_equal(points, rows.astype(points.dtype))
+    assert kept(rows.astype(np.float32)).dtype == np.float32
+    assert kept((rows * 3).astype(np.int32)).dtype == np.float32
+    assert kept(np.zeros((0, 3))).shape == (0, 3)
+
+
+@given(gappy(), st.booleans())
+def test_a_cloud_says_how_many_of_its_rows_are_no_points(
+    cloud: tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]], of_file: bool
+) -> None:
+    rows, is_point = cloud
+    place = np.array([0.0, 0.25, 0.5]) if of_file else None
+    payload = cloud_payload(rows, {"seed": b"1"}, file_viewpoint=place)
+    assert payload.points.tolist() == rows[is_point].tolist()
+    assert payload.ignored_points == np.count_nonzero(~is_point)
+    assert (payload.is_point is None) == is_point.all()
+    assert payload.is_point is None or payload.is_point.tolist() == is_point.tolist()
+    assert payload.options == {"seed": b"1"}
+    assert payload.file_viewpoint is place
+    with pytest.raises(Invalid, match=f"are {len(rows)}, all of them"):
+        cloud_payload(np.full_like(rows, np.nan))
+
+
+def test_a_large_image_may_be_posted_at_the_limit_of_the_points_that_matter() -> None:
+    assert most_rows(1_000_000) == 8_500_000 > 3840 * 2160
+    assert most_rows(1) == 8
 
 
 @pytest.mark.parametrize("of_image", [False, True])

@@ -6,7 +6,17 @@ from pathlib import Path
 
 import pytest
 
-from service.settings import NETWORK_NAMES, InvalidSetting, cpu_quota, load_settings, unknown_variables
+from service import settings as settings_module
+from service.settings import (
+    MAX_THREADS,
+    NETWORK_NAMES,
+    InvalidSetting,
+    Settings,
+    cpu_quota,
+    default_threads,
+    load_settings,
+    unknown_variables,
+)
 from tesnet import networks
 
 
@@ -78,6 +88,62 @@ def test_threads_follow_the_quota_of_the_container(tmp_path: Path) -> None:
     assert cpu_quota(tmp_path) == 0.5
     (tmp_path / "cpu.max").write_text("max 100000\n")
     assert cpu_quota(tmp_path) == math.inf
+
+
+@pytest.mark.parametrize("cores", [1, 2, 7, 8, 9, 64])
+@pytest.mark.parametrize("quota", [0.1, 0.5, 1.0, 1.9, 3.5, 8.0, 20.0, math.inf])
+@pytest.mark.parametrize("tells_affinity", [True, False])
+def test_there_is_a_thread_for_each_whole_core_that_may_be_used_and_at_least_one(
+    cores: int, quota: float, tells_affinity: bool, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(settings_module, "cpu_quota", lambda: quota)
+    if tells_affinity:
+        monkeypatch.setattr(os, "sched_getaffinity", lambda _: set(range(cores)))
+    else:
+        monkeypatch.delattr(os, "sched_getaffinity")
+        monkeypatch.setattr(os, "cpu_count", lambda: cores)
+    whole = max(1, min(cores, MAX_THREADS, math.floor(min(quota, 1000))))
+    assert default_threads() == Settings().num_threads == whole
+    monkeypatch.setattr(os, "cpu_count", lambda: None)
+    if not tells_affinity:
+        assert default_threads() == 1
+
+
+LIMITS: dict[str, tuple[float | None, list[float], list[float]]] = {
+    "port": (8000, [0, 65_535], [-1, 65_536]),
+    "num_threads": (None, [1, 1024], [0, 1025]),
+    "max_points": (1_000_000, [1, 100_000_000], [0, 100_000_001]),
+    "max_body_mb": (64.0, [0.001, 4096], [0, 4096.5]),
+    "max_held_mb": (512.0, [0.001, 1_048_576], [0, 1_048_577]),
+    "queue_size": (32, [1, 10_000], [0, 10_001]),
+    "max_batch": (1, [1, 64], [0, 65]),
+    "client_places": (None, [1, 10_000], [0, 10_001]),
+    "request_timeout": (30.0, [0.001, 3600], [0, 3600.5]),
+    "drain_timeout": (25.0, [0, 3600], [-0.1, 3600.5]),
+}
+"""Of every number: its default, the least and the most that is taken, and what is one too little or too much."""
+
+
+@pytest.mark.parametrize("field", LIMITS)
+def test_every_number_is_taken_from_its_least_to_its_most_and_has_its_default(field: str) -> None:
+    default, taken, refused = LIMITS[field]
+    variable = f"GRASP_{field.upper()}"
+    if field != "num_threads":
+        assert getattr(load_settings({}), field) == default
+    for value in taken:
+        assert getattr(load_settings({variable: str(value)}), field) == value
+    for value in refused:
+        with pytest.raises(InvalidSetting, match=variable):
+            load_settings({variable: str(value)})
+
+
+def test_every_number_has_its_limits_here() -> None:
+    numbers = {
+        name
+        for name, field in Settings.model_fields.items()
+        if field.annotation in (int, float) or field.annotation == (int | None)
+    }
+    assert numbers == set(LIMITS)
 
 
 def test_keys_and_origins_are_lists_and_keys_are_never_shown() -> None:

@@ -546,3 +546,16 @@ def test_at_rest_the_tips_lie_7_mm_past_the_contact_point(name: str) -> None:
     assert torch.equal(rest[:, :3, :3], poses[:, :3, :3])
     if hand.linkage_length is None:
         assert torch.equal(rest, poses)
+
+
+@given(st.floats(0.01, 0.2), st.lists(st.floats(0.0, 1.0), min_size=1, max_size=20))
+@settings(deadline=None)
+def test_a_hand_is_told_micrometres_and_no_more_than_it_opens(widest: float, shares: list[float]) -> None:
+    hand = replace(PANDA, max_width=widest)
+    widths = torch.tensor([share * widest for share in [*shares, 1.0]])
+    nowhere = torch.zeros(len(widths), dtype=torch.long)
+    told = Candidates(nowhere, nowhere, torch.eye(4).expand(len(widths), 4, 4), widths, hand).openings()
+    assert told.dtype == np.float64
+    assert (told <= widest).all()
+    assert np.abs(told - exact(widths)).max() < 1e-6
+    assert all(opening in (widest, round(opening, 6)) for opening in told.tolist())

@@ -295,3 +295,29 @@ def test_of_much_that_stands_on_a_found_support_the_nearest_to_the_camera_is_loo
     beyond = (found.unsought.points - found.viewpoints[0]).norm(dim=1)
     assert float(distance.max()) <= float(beyond.min()) + 0.005
     assert len(beyond) > len(found)
+
+
+@pytest.mark.parametrize(
+    ("a_cell", "fewest"), [(0.5, 1), (1.0, 1), (2.0, 2), (3.0, 3), (4.0, 4), (10.0, 4), (100.0, 4)]
+)
+def test_what_is_not_sought_counts_where_it_does_not_stand_alone(a_cell: float, fewest: int) -> None:
+    """In a cube of three cells' edge: four points, or a tenth of what a surface has there."""
+    sizes = range(1, 7)
+    places = [[0.005, 0.005, 0.05 * size] for size in sizes]
+    others = torch.tensor([place for place, size in zip(places, sizes, strict=True) for _ in range(size)])
+    found = cloud._unsought(torch.zeros(1, 3), others, 0.0045, a_cell)
+    assert found is not None
+    heights = sorted(round(float(height), 3) for height in found.points[:, 2])
+    assert heights == [round(0.05 * size, 3) for size in sizes if size >= fewest]
+
+
+@pytest.mark.parametrize(("distance", "counts"), [(0.0, True), (0.349, True), (0.351, False)])
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize("sign", [1, -1])
+def test_what_is_not_sought_counts_as_far_as_a_hand_reaches(
+    distance: float, counts: bool, axis: int, sign: int
+) -> None:
+    points = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]])
+    other = torch.tensor([0.05, 0.1, 0.15])
+    other[axis] = (points[1, axis] + distance) if sign > 0 else -distance
+    assert (cloud._unsought(points, other.expand(5, 3), 0.0045, 10.0) is not None) == counts

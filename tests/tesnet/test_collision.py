@@ -7,6 +7,7 @@ import pytest
 import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
+from scipy.spatial import ConvexHull
 
 from tesnet import candidates, collision
 from tesnet.cloud import PreparedCloud
@@ -336,3 +337,22 @@ def test_a_hand_holds_things_from_so_many_points_so_deep_in_it_on(count: int, de
     posted = torch.from_numpy(pose.apply(np.concatenate([places, beside]))).float()
     hands = open_hands(torch.from_numpy(np.stack([pose.matrix, np.eye(4) + np.diag([0, 0, 5.0], 1)])).float())
     assert collision.holds(posted, hands)[0] == (count >= collision.HELD_POINTS and deeper > 0)
+
+
+@pytest.mark.parametrize("share", [0.2, 1.0])
+def test_a_hand_is_looked_for_in_the_shadow_at_places_inside_its_parts_from_end_to_end(
+    hand: Gripper, share: float
+) -> None:
+    width = share * hand.max_width
+    for part in hand.parts:
+        places = np.array(collision._samples(part))
+        places[:, 1] += part.side * width / 2
+        planes = ConvexHull(part.corners(width)).equations
+        assert (places @ planes[:, :3].T + planes[:, 3]).max() < 1e-9
+        assert (places[:, 0] == 0).all()
+        if part.side:
+            assert (places[:, 2].min(), places[:, 2].max()) == pytest.approx((part.back, part.front))
+        else:
+            np.testing.assert_allclose(places[:, 2], part.front - 0.005)
+            assert np.abs(places[:, 1]).max() == pytest.approx(0.45 * part.thickness.full)
+            assert sorted(places[:, 1]) == pytest.approx(sorted(-places[:, 1]))

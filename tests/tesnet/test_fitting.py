@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import functools
 from typing import Literal
 
 import numpy as np
@@ -222,3 +223,34 @@ def test_what_swinging_tips_will_hold_is_looked_for_where_they_rest(width: float
     placed = fitting.fitted(cloud, candidate, CandidateConfig(centred=True), policy="fitted")
     assert float(placed.widths[0]) == pytest.approx(0.05 + 2 * 0.014, abs=0.004)
     assert float(at_rest(cloud, placed).Ts_canonical_grasp[0, 2, 3]) == pytest.approx(0.0, abs=1e-6)
+
+
+@pytest.mark.parametrize("name", ["franka", "rg2"])
+@pytest.mark.parametrize("policy", ["fitted", "full"])
+@pytest.mark.parametrize("centred", [False, True])
+def test_a_hand_has_the_opening_of_the_place_where_it_stands(
+    name: str, policy: Literal["fitted", "full"], centred: bool
+) -> None:
+    """Midway if that is clear of the support, else in place, else as it was found: pose and width from one of them."""
+    hand, config = HANDS[name].gripper, CandidateConfig(centred=centred)
+    elsewhere = 0
+    for seed in range(2):
+        query = tabletop_query(seed, max_candidates=800, gripper=hand)
+        cloud = prepared(query)
+        found, _ = generate(cloud, query, CandidateConfig())
+        span = fitting.spans(cloud, at_rest(cloud, found))
+        expected = found
+        for midway in (False, True):
+            if centred if midway else policy == "fitted":
+                moved, low = clear_of_support(cloud, fitting._moved(found, span, midway, policy), config)
+                rows = [
+                    moved.select(torch.tensor([row])) if not low[row] else expected.select(torch.tensor([row]))
+                    for row in range(len(found))
+                ]
+                elsewhere += int((low & (moved.widths != expected.widths)).sum())
+                expected = functools.reduce(Candidates.joined_by, rows)
+        placed = fitting.fitted(cloud, found, config, policy=policy)
+        assert torch.equal(placed.widths, expected.widths)
+        assert torch.equal(placed.Ts_canonical_grasp, expected.Ts_canonical_grasp)
+        assert torch.equal(placed.contact, found.contact)
+    assert policy == "full" or not centred or elsewhere > 0

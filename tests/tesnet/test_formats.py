@@ -165,6 +165,60 @@ def test_windows_lines_empty_lines_comments_and_further_columns_are_read() -> No
     np.testing.assert_array_equal(read_ply(content).points, [[1, 2, 3], [4, 5, 6]])
 
 
+@settings(max_examples=60, deadline=None)
+@given(st.data())
+def test_a_pcd_s_fields_are_found_wherever_they_stand_and_however_many_numbers_others_have(data: st.DataObject) -> None:
+    """Written here number by number: descriptors of several numbers, any order, any type, all three encodings."""
+    kinds = st.sampled_from(["F4", "F8", "U1", "U2", "U4", "I1", "I2", "I4"])
+    has_normals = data.draw(st.booleans())
+    wanted = ["x", "y", "z", *(("normal_x", "normal_y", "normal_z") if has_normals else ())]
+    others = [f"f{number}" for number in range(data.draw(st.integers(0, 4)))]
+    names = data.draw(st.permutations([*wanted, *others]))
+    fields = [
+        (name, data.draw(st.sampled_from(["F4", "F8"]) if name in wanted else kinds),
+         1 if name in wanted else data.draw(st.integers(1, 5)))
+        for name in names
+    ]  # fmt: skip
+    count = data.draw(st.integers(1, 6))
+    rng = np.random.default_rng(data.draw(st.integers(0, 999)))
+    values = {
+        name: rng.integers(1, 100, (count, numbers)).astype(f"<{kind[0].lower()}{kind[1]}")
+        for name, kind, numbers in fields
+    }
+    tells_counts = data.draw(st.booleans()) or any(numbers != 1 for _, _, numbers in fields)
+    encoding = data.draw(st.sampled_from(["ascii", "binary", "binary_compressed"]))
+    if encoding == "ascii":
+        rows = ("\n".join(" ".join(str(v) for n in names for v in values[n][row]) for row in range(count))).encode()
+    elif encoding == "binary":
+        rows = b"".join(values[name][row].tobytes() for row in range(count) for name in names)
+    else:
+        whole = b"".join(values[name].tobytes() for name in names)
+        packed = importlib.import_module("lzf").compress(whole)
+        packed = b"".join(b"\x00" + whole[n : n + 1] for n in range(len(whole))) if packed is None else packed
+        rows = sized(len(packed), len(whole)) + packed
+    size = [f"WIDTH {count}", "HEIGHT 1", f"POINTS {count}"]
+    if data.draw(st.booleans()):
+        size = [f"WIDTH {count}", "HEIGHT 1"]
+    lines = [
+        "VERSION 0.7",
+        f"FIELDS {' '.join(names)}",
+        f"SIZE {' '.join(kind[1] for _, kind, _ in fields)}",
+        f"TYPE {' '.join(kind[0] for _, kind, _ in fields)}",
+        *([f"COUNT {' '.join(str(numbers) for _, _, numbers in fields)}"] if tells_counts else []),
+        *size,
+        f"DATA {encoding}",
+    ]
+    found = read_pcd("\n".join([*lines, ""]).encode() + rows, count if encoding != "binary_compressed" else None)
+    np.testing.assert_array_equal(found.points, np.column_stack([values[name] for name in "xyz"]))
+    if has_normals:
+        assert found.normals is not None
+        np.testing.assert_array_equal(found.normals, np.column_stack([values[f"normal_{name}"] for name in "xyz"]))
+    else:
+        assert found.normals is None
+    with pytest.raises(TooManyPoints):
+        read_pcd("\n".join([*lines, ""]).encode() + rows, count - 1)
+
+
 def test_an_organised_pcd_has_rows_without_a_point() -> None:
     content = b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nWIDTH 3\nHEIGHT 1\nDATA ascii\n1 2 3\nnan nan nan\nnan 5 6\n"
     np.testing.assert_array_equal(read_pcd(content).points, [[1, 2, 3], [np.nan] * 3, [np.nan, 5, 6]])

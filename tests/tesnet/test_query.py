@@ -250,3 +250,110 @@ def test_a_hand_opens_wide_unless_its_tips_swing_as_they_close(name: str) -> Non
     assert ask(POINTS, gripper=hand).opening_policy == ("fitted" if swings else "full")
     for asked in ("fitted", "full"):
         assert ask(POINTS, gripper=hand, width=asked).opening_policy == asked
+
+
+@pytest.mark.parametrize("offset", [-0.03, 0.0, 0.02])
+@pytest.mark.parametrize("length", [None, 0.08, 0.2])
+def test_a_hand_of_one_s_own_swings_if_it_has_cranks_wherever_their_pivots_stand(
+    offset: float, length: float | None
+) -> None:
+    hand = replace(PANDA, linkage_length=length, linkage_offset=offset)
+    assert ask(POINTS, gripper=hand).opening_policy == ("full" if length is None else "fitted")
+    assert ask(POINTS, gripper=hand, width="full").opening_policy == "full"
+
+
+def test_the_least_of_every_option_is_taken() -> None:
+    query = ask(
+        POINTS,
+        up=UP,
+        support_height=-1e9,
+        approach=ApproachCone(UP, 0.0),
+        max_grasps=1,
+        min_score=0.0,
+        separation_translation=0.0,
+        separation_rotation_deg=0,
+        num_approach_points=1,
+        max_candidates=1,
+        seed=0,
+    )
+    assert query.support_height == -1e9
+    assert ask(POINTS, up=UP, support_height=1e9).support_height == 1e9
+    for height in (-1.001e9, 1.001e9):
+        with pytest.raises(InvalidQuery, match="support_height"):
+            ask(POINTS, up=UP, support_height=height)
+
+
+def test_the_defaults_are_those_that_the_interface_names() -> None:
+    query = ask(POINTS)
+    named: dict[str, Any] = {
+        "viewpoints": None,
+        "up": None,
+        "workspace": None,
+        "support_height": None,
+        "target": None,
+        "approach": None,
+        "max_grasps": 10,
+        "min_score": 0.0,
+        "separation_translation": 0.01,
+        "separation_rotation_deg": 15.0,
+        "num_approach_points": 32,
+        "max_candidates": 2000,
+        "gripper": PANDA,
+        "unseen": "free",
+        "width": None,
+        "seed": 0,
+        "model": None,
+        "calibrate": False,
+    }
+    assert {name: getattr(query, name) for name in named} == named
+
+
+@pytest.mark.parametrize(
+    ("up", "height", "says"), [("auto", 0.1, "give both, or neither"), (None, "auto", "needs `up`")]
+)
+def test_a_height_is_given_or_found_along_an_up_that_is(up: Any, height: Any, says: str) -> None:
+    with pytest.raises(InvalidQuery, match=says):
+        ask(POINTS, up=up, support_height=height)
+    for good in ({"up": "auto", "support_height": "auto"}, {"up": UP, "support_height": "auto"}, {"up": "auto"}):
+        ask(POINTS, **good)
+    with pytest.raises(InvalidQuery, match="give a direction x, y, z, or auto"):
+        ask(POINTS, up="down")
+
+
+@pytest.mark.parametrize("count", [1, 2, 5])
+def test_what_belongs_to_points_is_counted_from_0_to_the_last_viewpoint(count: int) -> None:
+    viewpoints = np.eye(count, 3) + 1
+    index = np.arange(len(POINTS)) % count
+    query = ask(POINTS, viewpoints=viewpoints, view_index=index)
+    assert query.view_index is not None
+    assert query.view_index.tolist() == index.tolist()
+    for wrong in (index + 1, index - 1):
+        with pytest.raises(InvalidQuery, match="count them from 0"):
+            ask(POINTS, viewpoints=viewpoints, view_index=wrong)
+
+
+@pytest.mark.parametrize("sign", [1, -1])
+@pytest.mark.parametrize("axis", range(3))
+@pytest.mark.parametrize(("distance", "moves"), [(63.0, False), (64.0, True), (1e9, True)])
+def test_a_cloud_of_float64_has_its_own_origin_from_64_m_on_either_way(
+    sign: int, axis: int, distance: float, moves: bool
+) -> None:
+    """An origin of whole metres, the middle of the points."""
+    points = POINTS - POINTS.mean(axis=0)
+    points[:, axis] += sign * distance
+    query = ask(points)
+    expected = np.zeros(3)
+    expected[axis] = sign * distance
+    if moves:
+        np.testing.assert_array_equal(query.offset, expected)
+    else:
+        assert query.origin is None
+    assert ask(points.astype(np.float32)).origin is None
+
+
+def test_a_query_counts_the_bytes_of_all_that_grows_with_its_cloud() -> None:
+    count = len(POINTS)
+    assert ask(POINTS).nbytes == 12 * count
+    whole = ask(POINTS, target=np.ones(count, bool), view_index=np.zeros(count, int), normals=np.ones((count, 3)))
+    assert whole.nbytes == (12 + 1 + 1 + 12) * count
+    assert ask(POINTS, target=Box(np.zeros(3), np.ones(3))).nbytes == 12 * count

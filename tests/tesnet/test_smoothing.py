@@ -155,3 +155,56 @@ def test_each_point_moves_to_the_weighted_plane_of_all_cells_about_it() -> None:
     kept = total >= 0.25 * total.median()
     moved = torch.stack([place for place, _ in expected])[kept]
     torch.testing.assert_close(smoothing.smoothed(rows, sd).double(), moved, atol=1e-6, rtol=0)
+
+
+def clusters(sizes: list[int]) -> tuple[Tensor, Tensor]:
+    """Points in clusters of such sizes, each within 2 mm and far from the others; and each point's cluster's size."""
+    rng = np.random.default_rng(1)
+    points = rng.uniform(-0.001, 0.001, (sum(sizes), 3))
+    points[:, 0] += np.repeat(0.1 * np.arange(len(sizes)), sizes)
+    return torch.from_numpy(points).float(), torch.tensor(np.repeat(sizes, sizes))
+
+
+@pytest.mark.parametrize("crowd", [17.0, 34.0, 50.0, 90.0])
+def test_a_point_is_alone_by_the_others_about_it_and_not_by_itself(crowd: float) -> None:
+    points, sizes = clusters(list(range(1, 12)))
+    noise = smoothing.Noise(sd=0.001, lone=0.5, crowd=crowd)
+    kept = smoothing.without_lone(torch.cat([points, sizes[:, None].float()], dim=1), noise)
+    assert kept[:, 3].tolist() == [size for size in sizes.tolist() if size - 1 > 0.06 * crowd]
+
+
+@pytest.mark.parametrize("others", [1, 2, 3])
+def test_exactly_the_share_that_a_lone_point_has_at_most_is_lone(others: int) -> None:
+    points, sizes = clusters([1, 2, 3, 4, 5, 6])
+    noise = smoothing.Noise(sd=0.001, lone=0.5, crowd=others / smoothing._LONE_SHARE)
+    kept = smoothing.without_lone(points, noise)
+    assert len(kept) == int((sizes - 1 > others).sum())
+
+
+@pytest.mark.parametrize(("lone", "goes"), [(0.0, False), (0.0125, False), (0.0126, True)])
+def test_nothing_goes_where_no_more_are_lone_than_of_quiet_clouds(lone: float, goes: bool) -> None:
+    points, _ = clusters([1, 2, 20])
+    kept = smoothing.without_lone(points, smoothing.Noise(sd=0.001, lone=lone, crowd=100.0))
+    assert len(kept) == (20 if goes else 23)
+
+
+@pytest.mark.parametrize("seed", range(4))
+def test_the_noise_of_a_small_cloud_is_that_of_a_loop_over_its_points(seed: int) -> None:
+    """So few that all of them are the sample: others in 6 mm, and what planes leave in balls of 8 mm."""
+    rng = np.random.default_rng(seed)
+    sheet = np.column_stack([rng.uniform(0, 0.02, (300, 2)), rng.normal(0, 0.001 * (seed + 1), 300)])
+    points = np.concatenate([sheet, rng.uniform(0, 0.2, (30, 3))]) + np.array([0.5, -2.0, 0.25])
+    points = points.astype(np.float32).astype(np.float64)
+    distances = np.linalg.norm(points[:, None] - points[None], axis=2)
+    others = (distances <= 0.006).sum(axis=1) - 1
+    crowd = float(np.sort(others)[(len(others) - 1) // 2])
+    residuals = []
+    for row in range(len(points)):
+        ball = points[distances[row] <= 0.008]
+        if len(ball) >= 12:
+            spread = np.linalg.svd(ball - ball.mean(axis=0), compute_uv=False)[-1]
+            residuals.append(np.sqrt(spread**2 / (len(ball) - 3)))
+    found = smoothing.measured(torch.from_numpy(points).float())
+    assert found.crowd == crowd
+    assert found.lone == pytest.approx((others <= 0.06 * crowd).mean(), abs=1e-9)
+    assert found.sd == pytest.approx(np.quantile(residuals, 0.25), rel=0.02)

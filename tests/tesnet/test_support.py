@@ -13,6 +13,7 @@ from numpy.typing import NDArray
 from bench import rooms
 from tesnet import support
 from tesnet.geometry import Box, Pose
+from tesnet.planes import SQUARE, Plane, basis
 from tesnet.query import GraspQuery
 from tests.tesnet.scenes import CAMERA, UP, ask, fresh_predictor, tabletop
 
@@ -151,3 +152,74 @@ def test_a_query_that_is_kept_about_another_origin_finds_the_same_plane_and_tell
     assert query.support_height == other.height
     heights = [float(note.split(" m along up")[0].rpartition(" ")[2]) for (note,) in (notes, notes_of_kept)]
     assert heights == pytest.approx([one.height, one.height], abs=2e-3)
+
+
+@pytest.mark.parametrize("noise_sd", [0.0, 0.0009, 0.004])
+@pytest.mark.parametrize("seed", range(3))
+def test_the_region_is_that_of_a_loop_over_its_points(seed: int, noise_sd: float) -> None:
+    """On a board of 0.3 x 0.2 m that lies anywhere: 2 cm inside its edge, above its noise, to 0.35 m."""
+    rng = np.random.default_rng(seed)
+    pose = Pose.random(rng, reach=0.2)
+    local = rng.uniform([-0.2, -0.15, -0.05], [0.2, 0.15, 0.45], (4000, 3))
+    local[:1500, 2] = rng.uniform(-0.001, 0.02, 1500)
+    up = pose.rotate(np.array([0.0, 0.0, 1.0]))
+    normals = pose.rotate(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]))
+    sides = np.column_stack([normals, normals @ pose.translation + [0.15, 0.15, 0.1, 0.1]])
+    plane = support.SupportPlane(up, float(up @ pose.translation), 0.5, noise_sd, sides)
+    lowest = max(0.003, 3 * noise_sd)
+    distances = [[abs(abs(x) - 0.13), abs(abs(y) - 0.08), abs(z - lowest), abs(z - 0.35)] for x, y, z in local.tolist()]
+    clear = np.min(distances, axis=1) > 1e-5  # of every limit, whichever way float32 rounds
+    expected = [abs(x) < 0.13 and abs(y) < 0.08 and lowest < z < 0.35 for x, y, z in local.tolist()]
+    found = support.region(pose.apply(local).astype(np.float32), plane)
+    assert found[clear].tolist() == np.array(expected)[clear].tolist()
+    assert 100 < found.sum() < 3000
+
+
+def worth_of(
+    up: Array, height: float, noise: float, points: Array, own: NDArray[np.bool_], sides: Array, eye: Any
+) -> float:
+    """`support._worth` a point at a time."""
+    across = basis(up)
+    uv, heights = points @ across[:, :2], points @ up - height
+    squares = [tuple(square) for square in np.floor(uv / SQUARE).astype(int).tolist()]
+    area = len({square for square, is_own in zip(squares, own, strict=True) if is_own}) * SQUARE**2
+    inside = [all(point @ side[:3] <= side[3] for side in sides) for point in points]
+    below = sum(one and h < -0.015 for one, h in zip(inside, heights, strict=True))
+    if area < 0.008 or (area < 0.09 and below > 0.2 * own.sum()):
+        return 0.0
+    if eye is not None and (over := eye @ up - height) > 0:
+        through = 0
+        for point, h in zip(points, heights, strict=True):
+            crossing = eye + over / (over - h) * (point - eye)
+            through += h < -0.015 and all(crossing @ side[:3] <= side[3] - SQUARE for side in sides)
+        if through > 0.15 * own.sum():
+            return 0.0
+    least = max(0.003, 3 * noise)
+    highest: dict[tuple[int, ...], float] = {}
+    things = [one and h > least for one, h in zip(inside, heights, strict=True)]
+    for square, thing, h in zip(squares, things, heights, strict=True):
+        if thing:
+            highest[square] = max(highest.get(square, -np.inf), h)
+    count = sum(thing and highest[square] <= 0.35 for square, thing in zip(squares, things, strict=True))
+    return float(np.sqrt(own.sum()) * (np.sqrt(count) if count >= 15 else 1.0))
+
+
+@pytest.mark.parametrize("seed", range(40))
+def test_what_speaks_for_a_plane_is_what_a_loop_over_the_points_counts(seed: int) -> None:
+    """Of boards of many sizes with more or less on, below and behind them, from many sides."""
+    rng = np.random.default_rng(seed)
+    half = rng.uniform(0.03, 0.25, 2)
+    board = np.column_stack([rng.uniform(-half, half, (400, 2)), rng.normal(0, 0.001, 400)])
+    things = rng.uniform([-0.1, -0.1, 0.0], [0.1, 0.1, rng.choice([0.1, 0.6])], (int(rng.choice([0, 12, 20, 90])), 3))
+    below = rng.uniform([-0.3, -0.3, -0.4], [0.3, 0.3, 0.0], (int(rng.choice([0, 60, 90, 300])), 3))
+    local = np.concatenate([board, things, below])
+    own = np.zeros(len(local), dtype=bool)
+    own[:400] = True
+    pose = Pose.random(rng, reach=0.2)
+    eye = None if seed % 4 == 0 else pose.apply(rng.uniform([-0.5, -0.5, -0.2], [0.5, 0.5, 0.6]))
+    points, up = pose.apply(local), pose.rotate(np.array([0.0, 0.0, 1.0]))
+    normals = pose.rotate(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]))
+    sides = np.column_stack([normals, normals @ pose.translation + np.repeat(half, 2)])
+    noise, height = float(rng.choice([0.0005, 0.003])), float(up @ pose.translation)
+    found = support._worth(Plane(up, height, noise, sides, own), points, eye)
+    assert found == pytest.approx(worth_of(up, height, noise, points, own, sides, eye), rel=1e-9)

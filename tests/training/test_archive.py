@@ -22,8 +22,9 @@ from training import archive, viewing
 from training.__main__ import main
 from training.archive import _draw, pack, unpack
 from training.generate import GenerateConfig, generate
+from training.parts import ArchivedView, keys_of
 from training.viewing import MoreViews
-from training.views import LabelledView, LabelsError, load_scene, scene_files
+from training.views import LabelledView, LabelsError, load_scene, save_scene, scene_files
 
 pytestmark = pytest.mark.sim
 
@@ -182,6 +183,54 @@ def test_parts_are_added_of_scenes_that_an_archive_lacks(labels: Path, tmp_path:
     assert pack([labels], tmp_path / "whole")["labels"] == account["labels"]
 
 
+def scenes_of_seeds(labels: Path, folder: Path, seeds: list[int]) -> Path:
+    """A folder with one scene of the labels under each of these seeds."""
+    folder.mkdir()
+    description, views = load_scene(next(path for path in scene_files([labels]) if load_scene(path)[1]))
+    for seed in seeds:
+        save_scene(folder / f"scene_{seed:07d}.npz", {**description, "seed": seed}, views)
+    return folder
+
+
+def test_a_new_part_comes_after_all_that_are_there_and_replaces_none(labels: Path, tmp_path: Path) -> None:
+    """Also where one in between was taken away, and scenes of the default seed 0 are known again."""
+    first, second, all_of_them = (
+        scenes_of_seeds(labels, tmp_path / name, seeds)
+        for name, seeds in (("first", [0, 1]), ("second", [2]), ("third", [0, 1, 2, 3]))
+    )
+    out = tmp_path / "archive"
+    pack([first], out)
+    pack([second], out)
+    (out / "labels_001.npz").rename(out / "labels_002.npz")
+    contents = {path: path.read_bytes() for path in out.iterdir()}
+    account = pack([all_of_them], out)
+    assert {path.name for path in out.iterdir()} == {"labels_000.npz", "labels_002.npz", "labels_003.npz"}
+    assert all(path.read_bytes() == content for path, content in contents.items())
+    assert {key[0] for key in keys_of(out / "labels_003.npz")} == {3}
+    assert account["scenes"] == 4
+    assert account["bytes"] == sum(path.stat().st_size for path in out.iterdir())
+    labelled = load_scene(scene_files([second])[0])[1]
+    assert account["labels"] == 4 * sum(len(view.outcomes) for view in labelled) == sum(account["outcomes"].values())
+
+
+def test_no_part_has_more_scenes_than_it_may(labels: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(archive, "SCENES_PER_PART", 2)
+    folder, out = scenes_of_seeds(labels, tmp_path / "labels", list(range(5))), tmp_path / "archive"
+    assert pack([folder], out)["scenes"] == 5
+    assert [len(keys_of(out / f"labels_{part:03d}.npz")) for part in range(3)] == [2, 2, 1]
+    assert len(list(out.iterdir())) == 3
+
+
+@pytest.mark.parametrize("count", [0, 1, 3, 7, None])
+def test_so_many_scenes_are_drawn_from_all_parts(labels: Path, tmp_path: Path, count: int | None) -> None:
+    out = tmp_path / "archive"
+    for part in range(3):
+        pack([scenes_of_seeds(labels, tmp_path / f"labels{part}", [part])], out)
+    chosen = _draw(sorted(out.glob("*.npz")), count, 0)
+    assert len(chosen) == 3
+    assert chosen.sum() == (3 if count is None else min(count, 3))
+
+
 def test_an_archive_without_its_objects_is_refused(
     labels: Path, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
@@ -227,3 +276,48 @@ def test_views_that_are_rendered_with_too_few_points_are_left_out_of_their_scene
         assert [len(view.outcomes) for view in views] == told
         kept.append(len(views))
     assert kept[0] == len(scene.views) > kept[-1]
+
+
+def test_a_new_camera_shows_the_candidates_of_whose_pair_it_sees_both_points(monkeypatch: pytest.MonkeyPatch) -> None:
+    """Near enough, that is; which of them are free of what it sees is judged anew."""
+    rng = np.random.default_rng(0)
+    view = labelled_view(count=60)
+    view = replace(view, collision_free=torch.zeros(60, dtype=torch.bool))
+    found = torch.stack([view.cloud.points[view.approach], view.cloud.points[view.contact]], dim=1).double().numpy()
+    distances = rng.choice([0.0, 0.0149, 0.0151, 0.04], (60, 2))
+    directions = np.stack([[Pose.random(rng).rotation[0] for _ in range(2)] for _ in range(60)])
+    wanted = view.cloud.T_cloud_canonical.apply(found + distances[:, :, None] * directions)
+    np.testing.assert_allclose(archive._shifts(view, wanted).numpy(), distances, atol=1e-5)
+    looked = viewing.Viewing((Pose.identity(),), "gaussian", 0)
+    halves = [
+        ArchivedView(
+            looked,
+            view.gripper,
+            wanted[some],
+            view.poses.numpy()[some],
+            view.widths.numpy()[some],
+            view.outcomes.numpy()[some],
+            view.collision_free.numpy()[some],
+        )
+        for some in (slice(20), slice(20, None))
+    ]
+    asked: list[ArchivedView] = []
+
+    def rendered(_: Any, everything: ArchivedView, __: Any) -> LabelledView:
+        asked.append(everything)
+        return view
+
+    monkeypatch.setattr(archive, "_render_view", rendered)
+    shown = archive._from_elsewhere(None, halves, looked, PreparationConfig())  # type: ignore[arg-type]
+    assert shown is not None
+    (everything,) = asked
+    np.testing.assert_array_equal(everything.places, wanted)
+    np.testing.assert_array_equal(everything.outcomes, view.outcomes.numpy())
+    near = (distances < 0.015).all(axis=1)
+    assert 5 < near.sum() < 40
+    assert torch.equal(shown.poses, view.poses[torch.from_numpy(near)])
+    assert torch.equal(shown.outcomes, view.outcomes[torch.from_numpy(near)])
+    assert torch.equal(shown.collision_free, ~blocked(shown.cloud, shown.candidates, "free"))
+    assert shown.collision_free.any()
+    monkeypatch.setattr(archive, "_render_view", lambda *_: None)
+    assert archive._from_elsewhere(None, halves, looked, PreparationConfig()) is None  # type: ignore[arg-type]

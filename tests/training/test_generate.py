@@ -11,7 +11,7 @@ import torch
 
 from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.protocol import query_about
-from simharness.sim.scene import SCALE_RANGES, restore_scene, scales_for
+from simharness.sim.scene import SCALE_RANGES, make_scene, restore_scene, scales_for
 from simharness.sim.world import World
 from tesnet import networks, weights
 from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, PreparedCloud, prepare
@@ -206,6 +206,14 @@ def test_the_candidates_that_are_tried_are_of_each_kind_as_many_as_asked_for(
     liked = set(sorted(free.nonzero()[:, 0].tolist(), key=lambda row: -logits[row])[: -(-int(free.sum()) // 4)])
     if mines:
         assert len(liked & set(chosen.tolist())) >= min(len(liked), (30 - met) // 2)
+    if mines and colliding == 3:  # of the other half as many are liked as there are left
+        draws = [
+            generating._choose(view.cloud, view.candidates, free, config, np.random.default_rng(seed), network)
+            for seed in range(20)
+        ]
+        half = (30 - met) // 2
+        left = (30 - met - half) * (len(liked) - half) / (int(free.sum()) - half)
+        assert np.mean([len(liked & set(draw.tolist())) for draw in draws]) == pytest.approx(half + left, abs=1.0)
     alike = replace(config, colliding_share=None)
     draws = [
         generating._choose(view.cloud, view.candidates, free, alike, np.random.default_rng(seed), None)
@@ -258,3 +266,52 @@ def test_views_of_fewer_points_than_the_service_answers_have_no_labels(monkeypat
         description, views = generating.label_scene(config, sets, number, judge)
         assert [len(view.cloud) for view in views] == [size for size in sizes if size >= MINIMUM_POINTS]
         assert len(description["views"]) == len(views) < len(sizes) == 2
+
+
+@pytest.mark.parametrize("name", ["franka", "rg2"])
+def test_what_is_stored_of_a_candidate_is_how_it_was_tried(name: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Pose and opening, which of hands whose tips swing is what they will hold; each with its own outcome."""
+    tried: list[tuple[np.ndarray[Any, Any], np.ndarray[Any, Any]]] = []
+
+    def judged(world: Any, hand: Any, poses: Any, openings: Any, snapshot: int) -> list[str]:
+        assert hand.gripper == HANDS[name].gripper
+        tried.append((np.asarray(poses), np.asarray(openings)))
+        return [OUTCOME_KINDS[number % len(OUTCOME_KINDS)] for number in range(len(openings))]
+
+    monkeypatch.setattr(generating, "label_strict", judged)
+    config = replace(CONFIG, gripper=name, labels_per_view=30)
+    _, views = generating.label_scene(config, generating.object_sets(config), 0, generating.Judge.of(config))
+    assert len(views) == len(tried) > 0
+    for view, (poses, openings) in zip(views, tried, strict=True):
+        assert len(view.outcomes) == len(openings) > 0
+        np.testing.assert_allclose(view.widths.numpy(), openings, atol=1.1e-6)
+        stored = view.cloud.T_cloud_canonical.matrix @ view.poses.double().numpy()
+        np.testing.assert_allclose(stored, poses, atol=1e-6)
+        assert view.outcomes.tolist() == [number % len(OUTCOME_KINDS) for number in range(len(openings))]
+        is_narrow = openings < HANDS[name].gripper.max_width - 1e-6
+        assert is_narrow.any() == (name == "rg2")
+
+
+@pytest.mark.parametrize("number", range(2))
+def test_a_scene_is_drawn_alike_whatever_hand_shall_take_its_things(
+    number: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """Also how it is looked at; things are larger for a wider hand."""
+    states: list[list[Any]] = []
+
+    def noted(function: Any) -> Any:
+        def call(*arguments: Any, **options: Any) -> Any:
+            rng = next(value for value in arguments if isinstance(value, np.random.Generator))
+            states[-1].append((rng.bit_generator.state, options.get("num_objects")))
+            return function(*arguments, **options)
+
+        return call
+
+    monkeypatch.setattr(generating, "make_scene", noted(make_scene))
+    monkeypatch.setattr(generating, "draw_viewing", noted(viewing.draw_viewing))
+    for gripper in ("franka", "random", "rg2"):
+        states.append([])
+        config = replace(CONFIG, gripper=gripper, views=2, labels_per_view=1)
+        generating.label_scene(config, generating.object_sets(config), number, generating.Judge.of(config))
+    assert len(states[0]) == 3
+    assert states[0] == states[1] == states[2]

@@ -12,6 +12,7 @@ from typing import Any
 import pytest
 
 from simharness.errors import RunBroken, SimError, UsageError
+from simharness.play import crew as crew_module
 from simharness.play.crew import Crew, Done, Emit, Event, Work, crew
 
 
@@ -84,3 +85,18 @@ def test_a_job_or_worker_that_fails_breaks_the_run_and_says_how(task: Squares, j
 def test_an_address_that_is_no_clusters_is_named(address: str) -> None:
     with pytest.raises(UsageError, match=f"--ray {address}: "), crew(Squares(), 1, address):
         pass
+
+
+@pytest.mark.parametrize("chosen", [None, "3"])
+def test_workers_compute_with_one_thread_unless_the_user_chose(
+    chosen: str | None, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    for name in ("OMP_NUM_THREADS", "OPENBLAS_NUM_THREADS"):
+        monkeypatch.delenv(name, raising=False)
+    if chosen is not None:
+        monkeypatch.setenv("OMP_NUM_THREADS", chosen)
+    with crew_module._one_thread_each():
+        assert os.environ["OMP_NUM_THREADS"] == (chosen or "1")
+        assert os.environ["OPENBLAS_NUM_THREADS"] == "1"
+    assert os.environ.get("OMP_NUM_THREADS") == chosen
+    assert "OPENBLAS_NUM_THREADS" not in os.environ

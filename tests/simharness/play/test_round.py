@@ -197,3 +197,23 @@ def test_a_round_is_played_as_its_settings_say(
     assert tried["hand"].gripper == hand
     np.testing.assert_array_equal(tried["T_world_grasp"], record.attempts[-1].T_world_grasp)
     assert tried["width"] == record.attempts[-1].width
+
+
+def test_seeds_of_requests_fill_their_range_and_differ() -> None:
+    seeds = [request_seed(seed, number, look) for seed in range(5) for number in range(10) for look in range(10)]
+    assert len(set(seeds)) == 500
+    assert 2**31 * 0.98 < max(seeds) < 2**31
+    assert -1 < min(seeds) < 2**31 * 0.02
+
+
+def test_random_numbers_of_a_scene_of_a_camera_and_of_a_request_have_nothing_in_common() -> None:
+    first = [scene_rng(0, 0).random(), *(camera_rng(0, 0, look).random() for look in range(3))]
+    others = [
+        scene_rng(0, 1).random(),
+        scene_rng(1, 0).random(),
+        camera_rng(0, 1, 0).random(),
+        camera_rng(1, 0, 0).random(),
+    ]
+    assert len({*first, *others}) == 8
+    assert scene_rng(3, 4).random() == scene_rng(3, 4).random()
+    assert camera_rng(3, 4, 5).random() == camera_rng(3, 4, 5).random()

@@ -14,12 +14,19 @@ from simharness.__main__ import main
 from simharness.play.folder import RunFolder
 from simharness.play.records import ModelRecord, RoundRecord, Serving
 from simharness.play.round import Attempted, Observed, Plan, play_round
-from simharness.report.causes import examine, failures, failures_report, failures_table, place_of
-from simharness.sim.camera import Observation, observe_from
+from simharness.report.causes import (
+    _hiding_body,
+    examine,
+    failures,
+    failures_report,
+    failures_table,
+    place_of,
+)
+from simharness.sim.camera import INTRINSICS, Images, Observation, observe_from
 from simharness.sim.execute import Grip, Outcome
 from simharness.sim.hand import HandContact
 from simharness.sim.objects import ObjectModel, load_object_set
-from simharness.sim.scene import TABLE_HEIGHT, restore_scene
+from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT, restore_scene
 from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
 from tesnet.geometry import Pose
@@ -132,3 +139,47 @@ def test_the_earliest_failures_are_told_with_their_lines_whatever_succeeded_betw
         told = (failure.seed, failure.round, failure.attempt, failure.outcome, failure.score)
         assert told == (recorded.seed, recorded.round, recorded.attempt, recorded.outcome, recorded.score)
         assert failure.height == pytest.approx(recorded.T_world_grasp[2, 3] - TABLE_HEIGHT)
+
+
+def test_what_hides_a_position_is_the_body_in_front_of_its_pixel() -> None:
+    """Looked up pixel by pixel; 4 mm behind what is seen there, a position may still be in sight."""
+    rng = np.random.default_rng(0)
+    shape = (INTRINSICS.height, INTRINSICS.width)
+    depth = rng.choice([0.0, 0.5, 0.9], shape).astype(np.float32)
+    bodies = rng.integers(0, 1000, shape)
+    images = Images(depth, np.zeros((*shape, 3), np.uint8), bodies)
+    pose = Pose.random(rng, reach=0.3)
+    hidden = 0
+    for _ in range(400):
+        row, column = int(rng.integers(-20, shape[0] + 20)), int(rng.integers(-20, shape[1] + 20))
+        z = float(rng.choice([-0.6, 0.4, 0.496, 0.503, 0.505, 0.7, 0.903, 0.905, 1.2]))
+        off = rng.uniform(-0.4, 0.4, 2)
+        ray = [(column + off[0] - INTRINSICS.cx) / INTRINSICS.fx, (row + off[1] - INTRINSICS.cy) / INTRINSICS.fy, 1.0]
+        found = _hiding_body(pose.apply(z * np.array(ray)), images, pose)
+        inside = z > 0 and 0 <= row < shape[0] and 0 <= column < shape[1]
+        expected = int(bodies[row, column]) if inside and 0 < depth[row, column] < z - 0.004 else None
+        assert found == expected
+        hidden += expected is not None
+    assert 50 < hidden < 300
+
+
+@pytest.mark.parametrize(("offset", "place"), [(0.0039, "on a seen surface"), (0.0041, "beside everything seen")])
+def test_a_surface_is_seen_within_4_mm_of_an_observed_point(offset: float, place: str) -> None:
+    empty = np.zeros((INTRINSICS.height, INTRINSICS.width))
+    images = Images(empty, np.zeros((*empty.shape, 3)), empty)
+    view = Observation(np.array([[0.1, 0.1, 0.1]]), np.zeros((1, 3)), np.eye(4)[None], (images,))
+    assert place_of(np.array([0.1, 0.1, 0.1 + offset]), 7, view) == place
+
+
+@pytest.mark.parametrize("axis", range(3))
+def test_where_a_planner_was_shown_nothing_is_told_by_the_side_of_the_box(axis: int) -> None:
+    empty = np.zeros((INTRINSICS.height, INTRINSICS.width))
+    images = Images(empty, np.zeros((*empty.shape, 3)), empty)
+    view = Observation(np.zeros((0, 3)), np.zeros((1, 3)), np.eye(4)[None], (images,))
+    for edge, outward in ((PERCEPTION_BOX.minimum, -1), (PERCEPTION_BOX.maximum, 1)):
+        position = np.array([0.15, 0.15, 0.15])
+        position[axis] = edge[axis] + 1e-4 * outward
+        low = axis == 2 and outward < 0
+        assert place_of(position, 7, view) == ("lower than the crop" if low else "outside the perception box")
+        position[axis] = edge[axis] - 1e-4 * outward
+        assert place_of(position, 7, view) == "beside everything seen"

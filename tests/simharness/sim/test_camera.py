@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Iterator
 
 import numpy as np
@@ -244,3 +245,48 @@ def test_the_cloud_is_cropped_where_the_table_is_believed_to_be(world: World, er
     )
     # Of the box's walls, or where the crop reaches into the table, of that.
     assert float(seen.points_world[:, 2].min()) == pytest.approx(max(lowest, TABLE_HEIGHT), abs=0.002)
+
+
+CENTRES: dict[Preset, tuple[float, float, float]] = {
+    "random": (0.15, 0.15, 0.25),
+    "giga": (0.15, 0.15, 0.1),
+    "multi3": (0.15, 0.15, 0.25),
+    "vgn6": (0.15, 0.15, 0.0),
+    "top": (0.15, 0.15, TABLE_HEIGHT),
+}
+
+
+def stands(preset: Preset, seed: int) -> list[tuple[float, float, float]]:
+    """Radius, polar angle and azimuth of each view about what its preset looks at, degrees."""
+    found = []
+    for camera in sample_camera(preset, np.random.default_rng(seed)):
+        np.testing.assert_allclose(camera.inverse().apply(CENTRES[preset])[:2], 0, atol=1e-9)  # in the image's middle
+        x, y, z = camera.translation - CENTRES[preset]
+        radius = math.hypot(x, y, z)
+        azimuth = math.degrees(math.atan2(y, x)) if math.hypot(x, y) > 1e-9 else -90.0
+        found.append((radius, math.degrees(math.acos(z / radius)), azimuth))
+    return found
+
+
+def test_presets_without_chance_stand_where_the_protocol_says() -> None:
+    assert stands("giga", 0) == [pytest.approx((0.6, 60, -90))]
+    assert stands("top", 0) == [pytest.approx((0.6, 0, -90), abs=1e-5)]
+    around = [(0.6, 30, azimuth if azimuth <= 180 else azimuth - 360) for azimuth in range(0, 360, 60)]
+    for found, (radius, polar, azimuth) in zip(stands("vgn6", 0), around, strict=True):
+        assert found[:2] == pytest.approx((radius, polar))
+        assert abs(found[2] - azimuth) % 360 == pytest.approx(0, abs=1e-6)
+
+
+@pytest.mark.parametrize(("preset", "widest"), [("random", 180.0), ("multi3", 120.0)])
+def test_presets_of_chance_fill_their_ranges_and_views_of_one_stand_evenly_about(preset: Preset, widest: float) -> None:
+    views = [stands(preset, seed) for seed in range(200)]
+    firsts = np.array([found[0] for found in views])
+    for column, (low, high) in enumerate(((0.6, 0.75), (45.0, 60.0), (0.0, widest))):
+        shares = (firsts[:, column] - low) / (high - low)
+        assert -1e-6 <= shares.min() < 0.05
+        assert 0.95 < shares.max() <= 1 + 1e-6
+    for found in views:
+        for number, (radius, polar, azimuth) in enumerate(found):
+            assert (radius, polar) == pytest.approx(found[0][:2])
+            turned = (azimuth - found[0][2] - 120 * number) % 360
+            assert min(turned, 360 - turned) == pytest.approx(0, abs=1e-6)

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import xml.etree.ElementTree as ET
 from collections.abc import Iterator
 from pathlib import Path
 
@@ -10,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 from scipy.spatial import ConvexHull
 
-from simharness.sim.hand import FINGER_BASE, Hand
+from simharness.sim.hand import FINGER_BASE, Hand, write_urdf
 from simharness.sim.world import World, data_path
 from tesnet.geometry import PANDA, Pose
 from tesnet.hands import HANDS
@@ -181,6 +182,49 @@ def test_the_solid_of_a_hand_is_that_of_its_parts(world: World, name: str) -> No
         box = world.add_static_box((0.001, 0.001, 0.001), position, colour=WHITE)
         assert world.distance(hand.body, box, limit=0.05) == pytest.approx(0.010, abs=0.0006)
         world.remove(box)
+
+
+@pytest.mark.parametrize("name", OTHERS)
+def test_each_mesh_is_its_part_of_the_closed_hand_without_the_margin_that_is_added(tmp_path: Path, name: str) -> None:
+    """A margin less on every side; the palm ends where it does as the hand is open, seen from the base link."""
+    gripper = HANDS[name].gripper
+    write_urdf(gripper, tmp_path)
+    for number, part in enumerate(gripper.parts):
+        found = _vertices(tmp_path / f"part{number}.obj") - [0.0, 0.0, gripper.hand_to_tcp]
+        least, most = part.corners(0.0).min(axis=0) + MARGIN, part.corners(0.0).max(axis=0) - MARGIN
+        if part.side:  # shorter by two margins, it may not grow to all of its thickness
+            outer = part.thickness.at(part.front - part.back - 2 * MARGIN) - MARGIN
+            least[1], most[1] = sorted((part.side * MARGIN, part.side * outer))
+        else:
+            least[2] += gripper.travel
+        np.testing.assert_allclose(found.min(axis=0), least, atol=1.5e-6)
+        np.testing.assert_allclose(found.max(axis=0), most, atol=1.5e-6)
+        tip = np.abs(found[found[:, 2] > most[2] - 1e-5])
+        breadth = part.breadth.front if part.tip_breadth is None else part.tip_breadth
+        thickness = part.thickness.front if part.side else part.thickness.front / 2
+        np.testing.assert_allclose(tip.max(axis=0)[:2], [breadth / 2 - MARGIN, thickness - MARGIN], atol=1.5e-6)
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_the_joints_of_a_hand_are_those_that_its_fingers_have(tmp_path: Path, name: str) -> None:
+    gripper = HANDS[name].gripper
+    joints = {joint.get("name"): joint for joint in ET.parse(write_urdf(gripper, tmp_path)).getroot().iter("joint")}
+    assert set(joints) == {
+        *("left_slide", "right_slide"),
+        *(("left_swing", "right_swing") if gripper.linkage_length else ()),
+    }
+    for joint_name, joint in joints.items():
+        limit, axis, origin = (joint.find(tag) for tag in ("limit", "axis", "origin"))
+        assert limit is not None
+        assert axis is not None
+        assert origin is not None
+        slides = str(joint_name).endswith("slide")
+        limits = (float(limit.get("lower", "nan")), float(limit.get("upper", "nan")))
+        assert limits == ((0.0, gripper.max_width / 2) if slides else (-0.2, 0.2))
+        assert (limit.get("effort"), limit.get("velocity")) == ("20.0", "0.2")
+        sign = "-1" if str(joint_name).startswith("right") else "1"
+        assert axis.get("xyz") == (f"0 {sign} 0" if slides else "0 0 1")
+        assert origin.get("xyz") == f"0 0 {FINGER_BASE if name == 'franka' else 0.0}"
 
 
 @pytest.mark.parametrize("name", SWINGING)

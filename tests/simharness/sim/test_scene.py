@@ -5,10 +5,12 @@ from __future__ import annotations
 import json
 from dataclasses import replace
 from pathlib import Path
+from typing import Any
 
 import numpy as np
 import pytest
 
+from simharness.sim import scene as scene_module
 from simharness.sim.objects import ObjectModel, SceneKind
 from simharness.sim.scene import (
     OBJECT_FRICTION,
@@ -240,3 +242,22 @@ def test_crowded_tables_hold_more_than_five() -> None:
     small = replace(CUBE, scale_hint=0.4)
     with World() as world:
         assert len(make_scene(world, "packed", [small], np.random.default_rng(0), num_objects=12).placed) > 8
+
+
+@pytest.mark.parametrize(("wanted", "tries"), [(1, 12), (5, 12), (6, 12), (7, 14), (9, 18)])
+def test_objects_that_find_no_place_are_tried_twelve_times_or_twice_an_object(
+    wanted: int, tries: int, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    tried: list[int] = []
+
+    def loaded(world: World, thing: Any, pose: Any) -> int:
+        tried.append(load(world, thing, pose))
+        return tried[-1]
+
+    load = scene_module._load
+    monkeypatch.setattr(scene_module, "_load", loaded)
+    monkeypatch.setattr(World, "contacts", lambda *_, **__: ["something"])
+    with World() as world:
+        assert make_scene(world, "packed", [CUBE], np.random.default_rng(0), num_objects=wanted).placed == ()
+        assert world.objects == ()
+    assert len(tried) == tries

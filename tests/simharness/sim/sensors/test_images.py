@@ -45,3 +45,12 @@ def test_an_interpolated_field_meets_the_image_and_keeps_most_of_its_deviation()
     field = interpolated_normal((480, 640), (120, 160), 0.005, np.random.default_rng(0))
     assert field.shape == (480, 640)
     assert field.std() == pytest.approx(0.0044, rel=0.03)
+
+
+def test_a_correlated_field_is_as_strong_at_the_border_and_goes_on_at_the_other_one() -> None:
+    fields = np.stack([correlated_normal((12, 16), 4.0, np.random.default_rng(seed)) for seed in range(2000)])
+    assert fields.std(axis=0) == pytest.approx(np.ones((12, 16)), abs=0.08)
+    beside = (fields[:, :, 0] * fields[:, :, 1]).mean()
+    assert beside > 0.5
+    assert (fields[:, :, 0] * fields[:, :, -1]).mean() == pytest.approx(beside, abs=0.05)
+    assert (fields[:, 0] * fields[:, -1]).mean() == pytest.approx(beside, abs=0.05)

@@ -2,12 +2,14 @@
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable
 
 import numpy as np
 import numpy.typing as npt
 import pytest
 
+from simharness.sim.sensors import time_of_flight
 from simharness.sim.sensors.time_of_flight import TimeOfFlight, axial_sigma, incidence, lateral_sigma
 from tesnet.geometry import CameraIntrinsics
 
@@ -61,3 +63,42 @@ def test_beyond_sixty_degrees_the_noise_along_the_axis_grows_with_the_slant() ->
 def test_edges_are_as_good_as_lost(camera: CameraIntrinsics, block: Array) -> None:
     measured = TimeOfFlight()(block, camera, np.random.default_rng(0))
     assert (measured[190:290, 259:261] == 0).mean() > 0.8
+
+
+@pytest.mark.parametrize("axis", [0, 1])
+@pytest.mark.parametrize("coarseness", [0.5, 1.0, 2.0, 4.0])
+@pytest.mark.parametrize("focal_length", [585.0, 300.0])
+def test_a_pixel_reads_another_as_far_away_as_the_formula_says_in_pixels_of_the_sensor(
+    axis: int, coarseness: float, focal_length: float, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    """A wall whose depth, by micrometres, tells the row or column; an image with fewer pixels moves by fewer."""
+    monkeypatch.setattr(time_of_flight, "axial_sigma", lambda depth, slant: np.zeros_like(depth))
+    monkeypatch.setattr(time_of_flight, "incidence", lambda depth, camera: np.zeros_like(depth))
+    fx = focal_length / coarseness
+    camera = CameraIntrinsics(width=200, height=160, fx=fx, fy=fx, cx=100.0, cy=80.0)
+    place = np.indices((160, 200))[axis]
+    depth = 0.7 + 1e-7 * place
+    measured = TimeOfFlight(focal_length)(depth, camera, np.random.default_rng(0))[20:-20, 20:-20]
+    moved = np.rint((measured - 0.7) / 1e-7) - place[20:-20, 20:-20]
+    moved = moved[measured > 0]
+    sigma = 0.8 / coarseness
+    steps = np.arange(-20, 21)
+    shares = np.array(
+        [math.erf((step + 0.5) / sigma / 2**0.5) - math.erf((step - 0.5) / sigma / 2**0.5) for step in steps]
+    )
+    assert moved.std() == pytest.approx(np.sqrt(shares / 2 @ steps**2), rel=0.08, abs=0.004)
+    assert abs(moved.mean()) < 0.03
+
+
+def test_at_the_border_what_would_be_read_beyond_is_the_border() -> None:
+    camera = CameraIntrinsics(width=9, height=7, fx=5850.0, fy=5850.0, cx=4.0, cy=3.0)
+    depth = np.full((7, 9), 0.7)
+    measured = TimeOfFlight()(depth, camera, np.random.default_rng(0))
+    assert (measured > 0.69).all()
+
+
+def test_beyond_85_degrees_nothing_gets_worse() -> None:
+    camera = CameraIntrinsics(width=41, height=41, fx=40.0, fy=40.0, cx=20.0, cy=20.0)
+    step = np.where(np.arange(41) < 20, 0.5, 5.0)[:, None] * np.ones(41)
+    assert incidence(step, camera).max() == np.deg2rad(85.0)
+    assert incidence(np.zeros((5, 5)), camera).max() == np.deg2rad(85.0)
