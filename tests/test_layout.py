@@ -54,3 +54,23 @@ def test_values_stay_as_they_were_made() -> None:
                 if made and "frozen=True" not in ast.unparse(made[0]) and isinstance(node, ast.ClassDef):
                     changing.setdefault(path.relative_to(ROOT).as_posix(), set()).add(node.name)
     assert changing == CHANGE
+
+
+def test_every_refusal_names_the_field_and_then_says_what_is_wrong_with_it() -> None:
+    seen = 0
+    for package in ("client", "service", "tesnet"):
+        for path in sorted((ROOT / package).rglob("*.py")):
+            for node in ast.walk(ast.parse(path.read_text(encoding="utf-8"))):
+                if not isinstance(node, ast.Call) or len(node.args) < 2:
+                    continue
+                if ast.unparse(node.func) not in ("Invalid", "InvalidQuery", "InvalidArgument", "InvalidSetting"):
+                    continue
+                field, words = (
+                    "".join(str(part.value) for part in ast.walk(argument) if isinstance(part, ast.Constant))
+                    for argument in node.args[:2]
+                )
+                where = f"{path.relative_to(ROOT)}:{node.lineno}"
+                assert field.count(" ") <= 1, where
+                assert words.count(" ") > 1 or isinstance(node.args[1], ast.Name | ast.Call), where
+                seen += 1
+    assert seen > 50

@@ -225,7 +225,8 @@ def test_any_other_foreign_answer_is_unexpected(status: int) -> None:
 def test_a_problem_document_with_another_status_than_its_answer_is_unexpected(
     refusing: Callable[..., Answering],
 ) -> None:
-    assert type(problem(Answer(500, {}, refusing(400).body))) is client.UnexpectedResponse
+    for status, told in ((500, 400), (400, 500)):
+        assert type(problem(Answer(status, {}, refusing(told).body))) is client.UnexpectedResponse
 
 
 @pytest.mark.parametrize(("text", "seconds"), [("0", 0.0), ("12", 12.0), ("soon", None), ("-3", None), ("", None)])

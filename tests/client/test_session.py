@@ -518,3 +518,16 @@ def test_both_clients_have_the_defaults_that_they_tell(kind: type) -> None:
     assert defaults(getattr(kind, "grasps")) == {"view_index": None, "normals": None, **of_call}  # noqa: B009
     of_image = {"mask": None, "T_cloud_camera": None, "depth_scale": 0.001, "stride": 1}
     assert defaults(getattr(kind, "grasps_from_depth")) == {**of_image, **of_call}  # noqa: B009
+
+
+def test_every_request_has_an_id_of_its_own_unless_one_is_given(
+    call: Call, server: ScriptedServer, points: Points, found: dict[str, Any]
+) -> None:
+    server.script = [answering(found)]
+    camera = {"fx": 50.0, "fy": 50.0, "cx": 1.0, "cy": 1.0}
+    for _ in range(2):
+        call(server.url, "grasps", points)
+        call(server.url, "grasps_from_depth", np.ones((4, 4)), intrinsics=camera)
+    ids = [received.headers["x-request-id"] for received in server.received]
+    assert len(set(ids)) == 4
+    assert {len(name) for name in ids} == {32}

@@ -14,8 +14,12 @@ import tritonclient.http as triton
 from numpy.typing import NDArray
 from tritonclient.utils import InferenceServerException
 
+from service.answers import answer_arrays
 from service.inference_protocol.decoding import decode
 from service.inference_protocol.tensors import HEADER_LENGTH, OUTPUTS
+from service.schemas import GraspOptions
+from tesnet.geometry import GraspSet
+from tesnet.result import REJECTIONS, GraspCounts, GraspResult
 from tests.conftest import PATIENCE_S
 
 Cloud = NDArray[np.float32]
@@ -291,3 +295,11 @@ def test_a_compressed_body_is_a_415_and_another_version_a_404(http: httpx.Client
     assert (compressed.status_code, "gzip" in compressed.json()["error"]) == (415, True)
     missing = http.get("/v2/models/tesnet/versions/9")
     assert (missing.status_code, "not loaded" in missing.json()["error"]) == (404, True)
+
+
+def test_outputs_have_the_shapes_and_types_that_their_metadata_tell() -> None:
+    counts = GraspCounts(0, 0, 0, 0, 0, dict.fromkeys(REJECTIONS, 0))
+    arrays = answer_arrays(GraspResult(GraspSet.empty(), counts, "no_candidates", (), {}), GraspOptions())
+    told = {output.name: (output.datatype, list(output.shape)) for output in OUTPUTS}
+    assert told.pop("meta") == ("BYTES", [1])
+    assert told == {name: ("FP64", [-1, *array.shape[1:]]) for name, array in arrays.items()}

@@ -148,3 +148,13 @@ def test_places_are_counted_by_client() -> None:
 @pytest.mark.parametrize("expected", [1e-6, 0.1, 1.0, 100.0])
 def test_twice_as_long_is_one_size_more(expected: float) -> None:
     assert job(2 * expected).size == job(expected).size + 1
+
+
+@pytest.mark.parametrize(("places", "spare"), [(1, 1), (3, 1), (4, 1), (7, 1), (8, 2), (32, 8)])
+def test_a_quarter_of_the_places_is_spare_and_at_least_one(places: int, spare: int) -> None:
+    turns = Turns(places)
+    for _ in range(places):
+        turns.add(job(1.0), busy=0.0)
+    while turns.has_place(job(0.01)):
+        turns.add(job(0.01), busy=0.0)
+    assert len(turns) == turns.most == places + spare

@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+from dataclasses import replace
 from typing import Any
 
 import numpy as np
@@ -7,11 +8,11 @@ import pytest
 import torch
 
 from tesnet.cloud import PreparedCloud
-from tesnet.geometry import Box
-from tesnet.outline import Outline, outline
+from tesnet.geometry import Box, Pose
+from tesnet.outline import Outline, is_low, outline
 from tesnet.query import GraspQuery
 from tests.tesnet.raycast import OVERHEAD, Can, Slab, overhead_query
-from tests.tesnet.scenes import UP, Array, ask, prepared, tabletop_query
+from tests.tesnet.scenes import UP, Array, ask, bare_cloud, prepared, tabletop_query
 
 CELL = 0.0045
 
@@ -144,3 +145,15 @@ def test_without_up_the_travel_is_along_the_sight() -> None:
     sight = points - OVERHEAD
     np.testing.assert_allclose(travel, sight / np.linalg.norm(sight, axis=1, keepdims=True), atol=1e-4)
     np.testing.assert_allclose((outward * travel).sum(axis=1), 0, atol=1e-5)
+
+
+@pytest.mark.parametrize("seed", range(3))
+def test_low_is_what_lies_less_than_17_mm_over_a_plane_that_is_known(seed: int) -> None:
+    pose = Pose.random(np.random.default_rng(seed), reach=0.3)
+    heights = np.array([-0.01, 0.0, 0.01, 0.0169, 0.0171, 0.03])
+    points = pose.apply(np.column_stack([np.linspace(-0.1, 0.1, 6), np.linspace(0.1, -0.05, 6), heights]))
+    up = pose.rotate(np.array([0.0, 0.0, 1.0]))
+    cloud = bare_cloud(points, up=torch.tensor(up).float(), support_height=float(up @ pose.translation))
+    assert is_low(cloud).tolist() == [True, True, True, True, False, False]
+    for unknown in (replace(cloud, up=None), replace(cloud, support_height=None)):
+        assert not is_low(unknown).any()

@@ -357,3 +357,21 @@ def test_a_query_counts_the_bytes_of_all_that_grows_with_its_cloud() -> None:
     whole = ask(POINTS, target=np.ones(count, bool), view_index=np.zeros(count, int), normals=np.ones((count, 3)))
     assert whole.nbytes == (12 + 1 + 1 + 12) * count
     assert ask(POINTS, target=Box(np.zeros(3), np.ones(3))).nbytes == 12 * count
+
+
+def test_no_array_of_a_query_can_be_changed() -> None:
+    count = len(POINTS)
+    query = ask(
+        POINTS + 1e5,
+        viewpoints=np.zeros(3),
+        up=UP,
+        target=np.ones(count, bool),
+        view_index=np.zeros(count, int),
+        normals=np.ones((count, 3)),
+        approach=ApproachCone(UP, 30.0),
+    )
+    arrays: list[Any] = [query.points, query.known_up, query.target, query.view_index, query.normals, query.origin]
+    assert query.approach is not None
+    for array in [*arrays, query.approach.direction]:
+        assert isinstance(array, np.ndarray)
+        assert not array.flags.writeable

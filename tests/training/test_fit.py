@@ -490,3 +490,36 @@ def test_the_calibration_is_fitted_where_it_is_told_to_be(folder: Path, tmp_path
     joined = [np.concatenate(parts) for parts in zip(*scored, strict=True)]
     assert header.calibration == pytest.approx(metrics.fit_calibration(*joined))
     assert header.calibration != weights.load(tmp_path / "same.safetensors")[1].calibration
+
+
+@pytest.mark.parametrize("name", ["edgegrasp", "gatv2", "tesnet-paper", "pointnetgpd", "gpd"])
+def test_the_recipe_of_comparisons_is_that_of_the_weights_that_were_compared(name: str) -> None:
+    _, header = weights.load(weights.default_weights(name))
+    recorded = (header.training or {})["recipe"]
+    assert len(recorded) >= 10
+    assert {key: asdict(PRESETS["comparison"])[key] for key in recorded} == recorded
+
+
+def test_recipes_differ_from_the_default_in_what_is_told_of_them() -> None:
+    default = asdict(Recipe())
+    told = {
+        "default": {},
+        "refine": {"learning_rate": 1e-3, "weight_decay": 0.02, "max_epochs": 3},
+        "product": {
+            "learning_rate": 1e-3, "weight_decay": 0.02, "max_epochs": 4, "candidates_per_view": 160,
+            "blocked_per_view": 40, "vary": True, "network": {"told": True},
+        },
+        "comparison": {
+            "learning_rate": 1e-3, "max_epochs": 8, "views_per_step": 2, "blocked_per_view": 80, "keep": "last",
+        },
+        "paper": {
+            "optimiser": "adam", "learning_rate": 1e-4, "weight_decay": 0.0, "patience": 6,
+            "smallest_learning_rate": 1e-6, "max_epochs": 200, "cosine": False, "views_per_step": 1,
+            "candidates_per_view": 2000, "blocked_per_view": 0,
+        },
+    }  # fmt: skip
+    found = {
+        name: {key: value for key, value in asdict(recipe).items() if value != default[key]}
+        for name, recipe in PRESETS.items()
+    }
+    assert found == told

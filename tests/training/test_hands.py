@@ -116,8 +116,7 @@ def test_what_scatters_does_so_about_its_middle_and_is_cut_at_both_ends(name: st
     least, most, expected, spread = CLIPPED[name]
     hands = hands_of(400)
     sizes = np.array([getattr(hand, name) for hand in hands])
-    assert sizes.min() >= least
-    assert sizes.max() <= most
+    assert (sizes.min(), sizes.max()) == (least, most)
     logs = np.log(sizes / [expected(hand.max_width) for hand in hands])
     assert np.median(logs) == pytest.approx(0.0, abs=0.05)
     inside = logs[(sizes > least) & (sizes < most)]
