@@ -14,8 +14,8 @@ NEAREST = 0.0015
 WANTED_REACH = 0.005
 """Tips that reach less far past a face hold it less well: for that they come nearer to the support."""
 
-LEAST_REACH = 0.003
-"""Tips that reach less far past a face slip off it."""
+LEAST_REACH = 0.0013
+"""Tips that reach less far past a face slip off it: a thing of 3 mm under tips 1.5 mm over the plane."""
 
 _FLATTEST_TRAVEL = 0.5
 """Stopping short gets no hand clear of the support whose travel has a smaller cosine with straight down."""

@@ -35,10 +35,15 @@ MINIMUM_POINTS = 32
 SUPPORT_NOISE = 0.005
 """Points lower than this above the support plane are the plane's own, as a camera sees it, and are dropped."""
 
+LEAST_SUPPORT_NOISE = 0.002
+"""Where the support is seen about its known height, no less than this above it is dropped, however quiet the camera."""
+
 MOST_SUPPORT_NOISE = 0.010
 """Where preparation follows the noise, no more than this above the support plane is dropped as its noise."""
 
-_DEVIATIONS = 3.0
+_DEVIATIONS, _SURELY = 3.0, 4.0
+"""Standard deviations that take most of a support's points away, and all but a few of ten thousand."""
+
 _FEWEST_BELOW = 200
 _NEAR_SUPPORT = 0.03
 
@@ -148,11 +153,8 @@ def prepare(
             are looked for on what stands on it, the rest counts for collision.
         between: called between blocks of work of some tens of milliseconds.
     """
-    noise = SUPPORT_NOISE if support is None else max(SUPPORT_NOISE, support.clearance)
-    posted, support_sd = _columns(query).to(device), 0.0
-    if config.smooth_above is not None:
-        support_sd = _support_sd(posted, query) if support is None else support.noise_sd
-        noise = max(noise, min(_DEVIATIONS * support_sd, MOST_SUPPORT_NOISE))
+    posted = _columns(query).to(device)
+    noise, support_sd = _support_noise(posted, query, config, support)
     posted = above_support(posted, query, noise)
     sought, on_things = in_workspace(posted, query), False
     if support is not None and query.target is None:
@@ -224,6 +226,18 @@ def prepare(
     )
 
 
+def _support_noise(
+    points: Tensor, query: GraspQuery, config: PreparationConfig, support: SupportPlane | None
+) -> tuple[float, float]:
+    """How high the noise of the support reaches among rows (N, 3 or more), and its standard deviation, 0 if unknown."""
+    reach = SUPPORT_NOISE if support is None else max(SUPPORT_NOISE, support.clearance)
+    if config.smooth_above is None:
+        return reach, 0.0
+    sd = _support_sd(points, query) if support is None else support.noise_sd
+    reach = max(reach, min(_DEVIATIONS * sd, MOST_SUPPORT_NOISE))
+    return _reach_of_seen(points, query, reach) if support is None else reach, sd
+
+
 def _support_sd(points: Tensor, query: GraspQuery) -> float:
     """Standard deviation of the support's rows (N, 3 or more) about its known plane, by those under it; 0 if unseen."""
     if query.known_up is None or not isinstance(query.support_height, float):
@@ -232,6 +246,22 @@ def _support_sd(points: Tensor, query: GraspQuery) -> float:
     below = query.support_height - heights
     below = below[(below >= 0) & (below <= _NEAR_SUPPORT)]
     return 1.4826 * float(below.median()) if len(below) >= _FEWEST_BELOW else 0.0
+
+
+def _reach_of_seen(points: Tensor, query: GraspQuery, otherwise: float) -> float:
+    """How high the noise of a support reaches that rows (N, 3 or more) show on both sides of its known height.
+
+    So things of 3 to 5 mm are told from it. A support that lies somewhat beside that height looks noisier than it is.
+    """
+    if query.known_up is None or not isinstance(query.support_height, float):
+        return otherwise
+    heights = points[:, :3] @ torch.tensor(query.known_up, dtype=points.dtype, device=points.device)
+    away = (heights - query.support_height).abs()
+    away = away[away <= SUPPORT_NOISE]
+    if len(away) < _FEWEST_BELOW:
+        return otherwise
+    reach = _SURELY * 1.4826 * float(away.median())
+    return otherwise if reach >= SUPPORT_NOISE else min(otherwise, max(reach, LEAST_SUPPORT_NOISE))
 
 
 def _quieter(table: Tensor, config: PreparationConfig, support_sd: float, between: Callable[[], None]) -> Tensor:

@@ -39,7 +39,10 @@ _BESIDE = (0.007, 0.011, 0.015)
 """How far outside of an edge one looks for what lies beyond: past the pixel of the edge itself."""
 
 _DROP = 0.006
-"""What lies beyond an edge is at least so much farther away than the face."""
+"""What lies beyond an edge is at least so much farther away than the face, or"""
+
+_LOW_DROP, _LEAST_DROP = 0.6, 0.0015
+"""beyond that of a face nearer to the support so much of its height, but no less than the latter."""
 
 _WALL = 0.5
 """A neighbour belongs to the wall under an edge where the cosine of its normal with the edge's direction is more."""
@@ -179,9 +182,18 @@ def _falls_away(cloud: PreparedCloud, query: GraspQuery, edge: Tensor, outward: 
             depth, first = image.look(places[rows])
             gap[rows] = image.depths[first] - depth
     empty = ~gap.isfinite()
-    farther = (gap > _DROP) | empty
+    farther = (gap > _drop(cloud, edge)) | empty
     seen_beyond = ~empty.all(dim=1)
     return farther.all(dim=1) & (seen_beyond | _where_plane_was_removed(cloud, posted, edge))
+
+
+def _drop(cloud: PreparedCloud, edge: Tensor) -> Tensor:
+    """(E, 1) how much farther away what lies beyond the edge points is, at least."""
+    drop = cloud.points.new_full((len(edge), 1), _DROP)
+    if cloud.up is None or cloud.support_height is None:
+        return drop
+    height = cloud.points[edge] @ cloud.up - cloud.support_height
+    return drop.minimum(_LOW_DROP * height[:, None]).clamp(min=_LEAST_DROP)
 
 
 def _image(viewpoint: Tensor, posted: Tensor, places: Tensor) -> RangeImage | None:

@@ -20,7 +20,7 @@ from tesnet.outline import Outline, outline
 from tesnet.points import farthest_points
 from tesnet.query import MAX_APPROACH_POINTS, ApproachCone
 from tests.tesnet.hand_twin import HANDS_TO_TRY, depth_in_hand
-from tests.tesnet.raycast import Bowl, Slab, overhead_query
+from tests.tesnet.raycast import Bowl, Slab, around, overhead_query
 from tests.tesnet.scenes import (
     CAMERA,
     UP,
@@ -458,12 +458,27 @@ def test_shallow_pairs_are_sought_on_low_faces_alone(monkeypatch: pytest.MonkeyP
 
 
 def test_a_thing_too_low_for_the_tips_has_no_candidates() -> None:
-    points, normals = box_surface((0.05, 0.07, 0.0065), 60_000, np.random.default_rng(0))
-    seen = seen_from(points + 0.00325 * UP, normals, CAMERA)
+    points, normals = box_surface((0.05, 0.07, 0.0052), 60_000, np.random.default_rng(0))
+    seen = seen_from(points + 0.0026 * UP, normals, CAMERA)
     query = ask(seen, viewpoints=CAMERA, up=UP, support_height=0.0)
-    for error, some in ((0.0, True), (0.004, False)):  # tips 4 mm over the plane reach 2.5 mm past the face
+    for error, some in ((0.0, True), (0.004, False)):  # tips 4 mm over the plane reach 1.2 mm past the face
         found, _ = candidates.generate(replace(prepared(query), support_error=error), query, CONFIG)
         assert (len(found) > 0) is some
+
+
+@pytest.mark.parametrize("height", [0.003, 0.004, 0.005, 0.007])
+@pytest.mark.parametrize("polar_deg", [0.5, 45.0])
+def test_a_thing_of_three_millimetres_is_taken_where_its_table_is_seen(height: float, polar_deg: float) -> None:
+    thing = Slab((0.0, 0.0, 0.0), (0.06, 0.04, height), 30.0)
+    query = overhead_query((thing,), around(1, polar_deg), max_candidates=20_000)
+    ready = prepared(query, smooth_above=0.0011)
+    found, _ = candidates.generate(ready, query, CONFIG)
+    assert len(found) > 20
+    heights = ready.T_cloud_canonical.apply(exact(ready.points))[:, 2]
+    assert heights.min() > 0.0015  # of the table nothing is left
+    tips = ready.T_cloud_canonical.apply(exact(found.Ts_canonical_grasp[:, :3, 3]))[:, 2] - PANDA.tip_offset
+    assert (tips >= NEAREST - 1e-4).all()
+    assert (tips <= height - LEAST_REACH + 1.5e-3).all()
 
 
 @pytest.mark.parametrize("height", [0.011, 0.04, 0.12])

@@ -239,7 +239,7 @@ def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: f
     assert ready.support_error == noise_sd
 
 
-@pytest.mark.parametrize("noise_sd", [0.0005, 0.0025, 0.008])
+@pytest.mark.parametrize("noise_sd", [0.0015, 0.0025, 0.008])
 @pytest.mark.parametrize("smooths", [True, False])
 def test_where_preparation_follows_the_noise_what_a_given_supports_noise_lifts_is_dropped_up_to_a_centimetre(
     noise_sd: float, smooths: bool
@@ -251,6 +251,27 @@ def test_where_preparation_follows_the_noise_what_a_given_supports_noise_lifts_i
     query = ask(np.concatenate([things, table]), viewpoints=CAMERA, up=UP, support_height=0.0)
     ready = prepared(query, smooth_above=0.05 if smooths else None)
     lowest = min(max(cloud.SUPPORT_NOISE, 3 * noise_sd), cloud.MOST_SUPPORT_NOISE) if smooths else cloud.SUPPORT_NOISE
+    heights = ready.T_cloud_canonical.apply(ready.points.numpy())[:, 2]
+    assert float(heights.min()) == pytest.approx(lowest + 0.001, abs=0.0015)
+
+
+@pytest.mark.parametrize(
+    ("noise_sd", "beside", "lowest"),
+    [(0.0, 0.0, 0.002), (0.0006, 0.0, 0.0024), (0.0010, 0.0, 0.004), (0.0016, 0.0, 0.005), (0.0003, 0.0015, 0.005),
+     (0.0003, -0.0015, 0.005)],
+)  # fmt: skip
+def test_of_a_support_that_is_seen_about_its_height_no_more_than_its_noise_is_dropped(
+    noise_sd: float, beside: float, lowest: float
+) -> None:
+    """One that lies beside the height that was told keeps the usual distance."""
+    rng = np.random.default_rng(0)
+    things = rng.uniform([-0.06, -0.06, lowest], [0.06, 0.06, 0.06], (30_000, 3))
+    table = np.column_stack([rng.uniform(-0.3, 0.3, (9000, 2)), beside + rng.normal(0, noise_sd, 9000)])
+    query = ask(np.concatenate([things, table]), viewpoints=CAMERA, up=UP, support_height=0.0)
+    posted = torch.from_numpy(query.points.copy())
+    assert cloud._reach_of_seen(posted, query, 0.005) == pytest.approx(lowest, abs=4e-4)
+    assert cloud._reach_of_seen(torch.from_numpy(things).float(), query, 0.005) == 0.005
+    ready = prepared(query, smooth_above=0.05)
     heights = ready.T_cloud_canonical.apply(ready.points.numpy())[:, 2]
     assert float(heights.min()) == pytest.approx(lowest + 0.001, abs=0.0015)
 
