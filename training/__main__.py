@@ -271,7 +271,7 @@ def _rendered(archive: Path, options: argparse.Namespace) -> Path:
 
 
 def _add_mean(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("weights", type=Path, nargs="+", help="files of one network")
+    parser.add_argument("--weights", type=Path, nargs="+", required=True, help="files of one network")
     parser.add_argument(
         "--validation", type=Path, nargs="+", required=True, help="folders of labelled validation scenes"
     )
