@@ -165,7 +165,8 @@ class GraspOptions(RequestPart):
     support_height: float | Literal["auto"] | None = Field(
         default=None,
         description="Height of the support plane along `up` in metres (needs `up`): points lower than 5 mm above it "
-        "are dropped, and the hand stays 4 mm clear of it, or 1.5 mm where a thing is too thin for more: the height is "
+        "(down to 2 mm where a quiet camera sees it there) are dropped, and the hand stays "
+        "4 mm clear of it, or 1.5 mm where a thing is too thin for more: the height is "
         "taken to be exact. Tips that swing forward come lower if they close on nothing. `auto` finds the plane that "
         "things stand on, keeps clear of its noise as well, and `warnings` says where; without a `target`, grasps are "
         "then looked for on those things alone, up to 0.35 m above it. Default: none.",
