@@ -80,7 +80,7 @@ def _ask(client: GraspClient, chosen: argparse.Namespace) -> GraspReply:
         mask=None if chosen.mask is None else read_bytes(chosen.mask),
         T_cloud_camera=None if chosen.camera_pose is None else np.reshape(chosen.camera_pose, (4, 4)),
         depth_scale=DEFAULT_DEPTH_SCALE if chosen.depth_scale is None else chosen.depth_scale,
-        stride=chosen.stride or 1,
+        stride=1 if chosen.stride is None else chosen.stride,
         request_id=chosen.request_id,
         **options,
     )

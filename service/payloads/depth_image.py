@@ -113,8 +113,6 @@ def _check_metres(points: Points, depths: NDArray[Any], scale: float | None) -> 
 def _pose(camera: DepthCamera) -> Pose:
     if camera.T_cloud_camera is None:
         return Pose.identity()
-    if list(camera.T_cloud_camera[3]) != [0, 0, 0, 1]:
-        raise Invalid("T_cloud_camera", f"has the last row {list(camera.T_cloud_camera[3])}; it must be [0, 0, 0, 1]")
     try:
         return Pose.nearest(camera.T_cloud_camera)
     except ValueError as error:

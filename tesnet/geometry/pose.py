@@ -79,7 +79,7 @@ class Pose:
     @classmethod
     def from_matrix(cls, matrix: ArrayLike) -> Pose:
         """From a homogeneous (4, 4) matrix."""
-        array = frozen(matrix, (4, 4), "matrix")
+        array = _homogeneous(matrix)
         return cls(array[:3, :3], array[:3, 3])
 
     @classmethod
@@ -89,7 +89,7 @@ class Pose:
         Raises:
             ValueError: also where R R^T differs from the identity by more than 0.005; three decimals leave 0.002.
         """
-        array = frozen(matrix, (4, 4), "matrix")
+        array = _homogeneous(matrix)
         deviation = float(np.abs(array[:3, :3] @ array[:3, :3].T - np.eye(3)).max())
         if not _ORTHONORMAL_TOLERANCE < deviation <= ROUNDED_TOLERANCE:
             return cls(array[:3, :3], array[:3, 3])
@@ -158,6 +158,16 @@ class Pose:
     def rotate(self, directions: ArrayLike) -> Array:
         """Directions (..., 3) in b as directions in a."""
         return np.asarray(np.asarray(directions, dtype=np.float64) @ self.rotation.T)
+
+
+def _homogeneous(matrix: ArrayLike) -> Array:
+    array = frozen(matrix, (4, 4), "matrix")
+    if np.abs(array[3] - [0.0, 0.0, 0.0, 1.0]).max() > _ORTHONORMAL_TOLERANCE:
+        given = ", ".join(f"{value:g}" for value in array[3])
+        raise ValueError(
+            f"its last row is [{given}]; it must be [0, 0, 0, 1]: row by row, the translation in the last column"
+        )
+    return array
 
 
 def quaternions_xyzw(rotations: ArrayLike) -> Array:

@@ -183,6 +183,17 @@ def test_a_zero_and_a_default_that_are_given_are_sent(
     assert options == (asked or {"width": "full", "unseen": "free", "frame_convention": "panda"})
 
 
+def test_a_stride_of_nothing_is_left_to_the_service_to_refuse(
+    server: ScriptedServer, tmp_path: Path, found: dict[str, Any]
+) -> None:
+    np.save(tmp_path / "depth.npy", np.ones((9, 7), dtype=np.uint16))
+    server.script = [answering(found)]
+    words = "--intrinsics 50 60 3.5 4.5 --stride 0"
+    assert main([str(tmp_path / "depth.npy"), "--url", server.url, *words.split()]) == 0
+    (received,) = server.received
+    assert b'"stride":0' in received.body.replace(b" ", b"")
+
+
 @pytest.mark.parametrize("scale", ["0.001", "0.0005"])
 @pytest.mark.parametrize("stride", ["1", "2", "3"])
 def test_the_flags_of_a_depth_image_are_the_arguments_of_the_client(

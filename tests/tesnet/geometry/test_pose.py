@@ -1,5 +1,8 @@
 from __future__ import annotations
 
+from collections.abc import Callable
+from typing import Any
+
 import numpy as np
 import pytest
 from hypothesis import given, settings
@@ -186,3 +189,13 @@ def test_what_is_no_rotation_stays_refused() -> None:
         matrix = np.diag([scale, scale, scale, 1.0])
         with pytest.raises(ValueError, match="no rotation matrix"):
             Pose.nearest(matrix)
+
+
+@pytest.mark.parametrize("make", [Pose.from_matrix, Pose.nearest])
+def test_a_transposed_matrix_is_told_apart(make: Callable[[Any], Pose]) -> None:
+    """Its rotation is one, too, and its translation would be lost."""
+    matrix = Pose.look_at([0.1, 0.2, 0.6], [0.0, 0.0, 0.0], [0.0, 0.0, 1.0]).matrix
+    assert_same(make(matrix), Pose.from_matrix(matrix))
+    for wrong in (matrix.T, np.diag([1.0, 1.0, 1.0, 2.0])):
+        with pytest.raises(ValueError, match=r"last row is \[.*\]; it must be \[0, 0, 0, 1\]"):
+            make(wrong)
