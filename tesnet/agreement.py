@@ -34,10 +34,12 @@ class AgreementConfig:
     Args:
         distance: of TCPs, standard deviation of the kernel.
         angle_deg: between hands, likewise.
+        share: of the average in the result; the rest is the candidate's own.
     """
 
     distance: float = 0.008
     angle_deg: float = 20.0
+    share: float = 0.5
 
     @classmethod
     def stored(cls, section: Mapping[str, Any] | None) -> AgreementConfig | None:
@@ -48,9 +50,9 @@ class AgreementConfig:
 def agreed(
     logits: Tensor, poses: Tensor, config: AgreementConfig, between: Callable[[], None] = lambda: None
 ) -> Tensor:
-    """The logits (C,), each averaged with those of the candidates about it.
+    """The logits (C,), each between itself and the average over it and the candidates about it.
 
-    Each candidate weighs 1 for itself and another one exp(-(d^2 / distance^2 + t^2 / angle^2) / 2), where d is the
+    In the average a candidate weighs 1 for itself and another one exp(-(d^2 / distance^2 + t^2 / angle^2) / 2), where d is the
     distance of their TCPs and t^2 = 2 - 2 cos(turn) from hand to hand, a parallel hand turned by half a turn about z
     being the same.
 
@@ -76,4 +78,4 @@ def agreed(
         kernel[rows[:, None] == about[None]] = 0.0
         total[rows] += kernel @ strongest[about]
         weight[rows] += kernel.sum(dim=1)
-    return total / weight
+    return torch.lerp(logits, total / weight, config.share)

@@ -13,7 +13,7 @@ from torch import Tensor
 from tesnet import agreement
 from tesnet.agreement import AgreementConfig, agreed
 
-CONFIG = AgreementConfig(distance=0.008, angle_deg=20.0)
+CONFIG = AgreementConfig(distance=0.008, angle_deg=20.0, share=0.5)
 
 
 def some_poses(count: int, seed: int = 0, extent: float = 0.03) -> Tensor:
@@ -39,11 +39,11 @@ def by_a_loop(logits: Tensor, poses: Tensor, config: AgreementConfig) -> list[fl
             square = (2.0 - 2.0 * math.cos(min(turns))) / math.radians(config.angle_deg) ** 2
             kernel = math.exp(-(apart**2 + square) / 2.0)
             total, weight = total + kernel * min(max(other, -6.0), 6.0), weight + kernel
-        found.append(total / weight)
+        found.append((1 - config.share) * own + config.share * total / weight)
     return found
 
 
-@pytest.mark.parametrize("config", [CONFIG, AgreementConfig(0.015, 20.0), AgreementConfig(0.008, 60.0)])
+@pytest.mark.parametrize("config", [CONFIG, AgreementConfig(0.015, 20.0, 1.0), AgreementConfig(0.008, 60.0, 0.2)])
 def test_logits_are_those_of_a_loop_over_all_pairs(config: AgreementConfig) -> None:
     poses = some_poses(120)
     logits = torch.from_numpy(np.random.default_rng(1).normal(0.0, 5.0, 120)).float()
@@ -69,8 +69,10 @@ def test_a_hand_turned_by_half_a_turn_about_its_travel_is_the_same_one() -> None
 
 def test_of_two_equal_grasps_each_has_the_mean_and_none_decides_alone() -> None:
     poses = some_poses(1).expand(2, 4, 4)
-    assert agreed(torch.tensor([1.0, 3.0]), poses, CONFIG).tolist() == pytest.approx([2.0, 2.0])
-    assert agreed(torch.tensor([1.0, -80.0]), poses, CONFIG).tolist() == pytest.approx([-2.5, -39.5])
+    whole = AgreementConfig(0.008, 20.0, 1.0)
+    assert agreed(torch.tensor([1.0, 3.0]), poses, whole).tolist() == pytest.approx([2.0, 2.0])
+    assert agreed(torch.tensor([1.0, 3.0]), poses, CONFIG).tolist() == pytest.approx([1.5, 2.5])
+    assert agreed(torch.tensor([1.0, -80.0]), poses, whole).tolist() == pytest.approx([-2.5, -39.5])
 
 
 def test_the_order_of_candidates_does_not_matter() -> None:
@@ -91,7 +93,7 @@ def test_of_very_many_candidates_some_stand_for_all(monkeypatch: pytest.MonkeyPa
 def test_nothing_agrees_with_nothing_and_headers_without_it_take_networks_at_their_word() -> None:
     assert agreed(torch.empty(0), torch.empty(0, 4, 4), CONFIG).shape == (0,)
     assert AgreementConfig.stored(None) is None
-    assert AgreementConfig.stored({"distance": 0.01, "angle_deg": 5.0}) == AgreementConfig(0.01, 5.0)
+    assert AgreementConfig.stored({"distance": 0.01, "angle_deg": 5.0}) == AgreementConfig(0.01, 5.0, 0.5)
 
 
 def test_work_is_cut_into_blocks() -> None:
