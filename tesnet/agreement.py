@@ -52,9 +52,9 @@ def agreed(
 ) -> Tensor:
     """The logits (C,), each between itself and the average over it and the candidates about it.
 
-    In the average a candidate weighs 1 for itself and another one exp(-(d^2 / distance^2 + t^2 / angle^2) / 2), where d is the
-    distance of their TCPs and t^2 = 2 - 2 cos(turn) from hand to hand, a parallel hand turned by half a turn about z
-    being the same.
+    In the average a candidate weighs 1 for itself and another one exp(-(d^2 / distance^2 + t^2 / angle^2) / 2), where d
+    is the distance of their TCPs and t^2 = 2 - 2 cos(turn) from hand to hand, a parallel hand turned by half a turn
+    about z being the same.
 
     Args:
         logits: (C,).
