@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from tesnet import calibration, candidates, cloud, collision, networks, notices, ranking, support, weights
-from tesnet.agreement import AgreementConfig, agreed
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import GraspSet, Pose
 from tesnet.networks import Network
@@ -53,7 +52,7 @@ class ModelInfo:
         name, version: of the weights; those of a network without weights never change.
         weights_sha256: of the file; None without one.
         card: data, seed and metrics of the training, as the weights' header tells them.
-        configuration: network, preparation, candidates and, where candidates are averaged, agreement.
+        configuration: network, preparation and candidates.
     """
 
     name: str
@@ -68,9 +67,8 @@ class GraspPredictor:
 
     Args:
         network: in evaluation mode, on `device`.
-        configuration: sections `network`, `preparation`, `candidates` and perhaps `agreement`, as in a weights file's
-            header.
-        calibration: (a, b) of score = sigmoid(a * logit + b), before candidates agree.
+        configuration: sections `network`, `preparation` and `candidates`, as in a weights file's header.
+        calibration: (a, b) of score = sigmoid(a * logit + b).
         model: what to tell about it.
         device: where everything is computed.
         num_threads: CPU threads of the whole process while no other one keeps the cores busy; None for torch's number.
@@ -92,7 +90,6 @@ class GraspPredictor:
         self._calibration = calibration
         self._preparation = cloud.PreparationConfig(**configuration["preparation"])
         self._candidates = candidates.CandidateConfig.stored(configuration["candidates"])
-        self._agreement = AgreementConfig.stored(configuration.get("agreement"))
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu", num_threads: int | None = None) -> GraspPredictor:
@@ -112,8 +109,6 @@ class GraspPredictor:
         network, header = networks.load(path)
         try:
             sections = {name: dict(header.configuration[name]) for name in ("network", "preparation", "candidates")}
-            if "agreement" in header.configuration:
-                sections["agreement"] = dict(header.configuration["agreement"])
             model = ModelInfo(header.network, header.version, weights.sha256(path), header.training or {}, sections)
             return cls(network.to(chosen), sections, header.calibration, model, chosen, num_threads)
         except (KeyError, TypeError, ValueError) as error:
@@ -299,10 +294,7 @@ class GraspPredictor:
         for rows in torch.arange(len(found.free), device=self.device).split(self._network.scored_at_once):
             clock.check()
             logits.append(self._network.score(features, prepared, found.free.select(rows)))
-        log_odds = a * torch.cat(logits) + b
-        if self._agreement is not None:
-            log_odds = agreed(log_odds, found.free.Ts_canonical_grasp, self._agreement, clock.check)
-        scores = torch.sigmoid(log_odds)
+        scores = torch.sigmoid(a * torch.cat(logits) + b)
         self._synchronise()
         return scores
 
@@ -430,12 +422,11 @@ def _further(query: GraspQuery, number: int) -> GraspQuery:
 
 def configuration_of(network: Network) -> dict[str, dict[str, Any]]:
     """The configuration that the header of a newly trained network's weights carries, with today's candidates."""
-    sections = {
+    return {
         "network": asdict(network.config),
         "preparation": asdict(network.preparation),
         "candidates": asdict(candidates.CandidateConfig()),
     }
-    return sections if network.agreement is None else sections | {"agreement": asdict(network.agreement)}
 
 
 def _device(name: str) -> torch.device:

@@ -25,7 +25,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from tesnet.agreement import AgreementConfig
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.networks.pairs import PAIR_FEATURES, pair_features
@@ -64,7 +63,6 @@ class BallNetwork(nn.Module):
     """
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
-    agreement: ClassVar[AgreementConfig | None] = None
     scored_at_once: ClassVar[int] = 200
     knows_hands: ClassVar[bool] = False
 

@@ -13,7 +13,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from tesnet.agreement import AgreementConfig
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import PANDA
@@ -46,7 +45,6 @@ class Heuristic(nn.Module):
     """Scores candidates by geometry alone."""
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig()
-    agreement: ClassVar[AgreementConfig | None] = None
     scored_at_once: ClassVar[int] = 2_500
     knows_hands: ClassVar[bool] = False
 

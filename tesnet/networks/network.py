@@ -11,7 +11,6 @@ from typing import TYPE_CHECKING, Any, ClassVar, Protocol
 import torch
 from torch import Tensor, nn
 
-from tesnet.agreement import AgreementConfig
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 
@@ -29,8 +28,6 @@ class Network(Protocol):
     config: Any
     preparation: ClassVar[PreparationConfig]
     """How clouds are prepared when the network is trained afresh; of trained weights the header has the last word."""
-    agreement: ClassVar[AgreementConfig | None]
-    """How candidates agree on their scores when the network is trained afresh; None: each has its own."""
     scored_at_once: ClassVar[int]
     """So many candidates take a core some tens of milliseconds; between as many it is asked whether anybody waits."""
 

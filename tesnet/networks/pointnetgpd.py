@@ -19,7 +19,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from tesnet.agreement import AgreementConfig
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.geometry import PANDA
@@ -58,7 +57,6 @@ class PointNetGPD(nn.Module):
     """Scores each candidate by the N points of its own region; nothing is shared between candidates."""
 
     preparation: ClassVar[PreparationConfig] = FINE
-    agreement: ClassVar[AgreementConfig | None] = None
     scored_at_once: ClassVar[int] = 200
     knows_hands: ClassVar[bool] = False
 

@@ -15,7 +15,6 @@ from typing import ClassVar
 import torch
 from torch import Tensor, nn
 
-from tesnet.agreement import AgreementConfig
 from tesnet.candidates import Candidates, at_rest
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.layers import PointTransformerConv, SAGEConv
@@ -83,7 +82,6 @@ class TesNet(nn.Module):
     """Scores candidate grasps of a prepared cloud."""
 
     preparation: ClassVar[PreparationConfig] = PreparationConfig(smooth_above=0.0011)
-    agreement: ClassVar[AgreementConfig | None] = AgreementConfig()
     scored_at_once: ClassVar[int] = 500
 
     def __init__(self, config: TesNetConfig) -> None:

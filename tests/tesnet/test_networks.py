@@ -9,7 +9,6 @@ import pytest
 import torch
 
 from tesnet import cloud, networks, weights
-from tesnet.agreement import AgreementConfig
 from tesnet.candidates import Candidates
 from tesnet.networks import Network
 from tesnet.networks.tesnet import TesNet, TesNetConfig
@@ -35,7 +34,6 @@ class Counting(torch.nn.Module):
     """The least that is a network: its feature of a cloud is the number of its points, and all candidates score it."""
 
     preparation: ClassVar[cloud.PreparationConfig] = cloud.PreparationConfig(voxel_size=0.006)
-    agreement: ClassVar[AgreementConfig | None] = None
     scored_at_once: ClassVar[int] = 100
     knows_hands: ClassVar[bool] = False
 

@@ -3,7 +3,7 @@ from __future__ import annotations
 import functools
 import subprocess
 import sys
-from dataclasses import asdict, replace
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 from unittest.mock import Mock
@@ -15,9 +15,8 @@ from scipy.spatial import cKDTree
 
 from tesnet import cloud, collision, networks, notices, weights
 from tesnet import predictor as predictor_module
-from tesnet.agreement import AgreementConfig, agreed
 from tesnet.errors import DeviceError, GaveUp, WeightsError
-from tesnet.geometry import PANDA, Box, GraspSet
+from tesnet.geometry import PANDA, Box
 from tesnet.hands import HANDS
 from tesnet.predictor import GraspPredictor, configuration_of
 from tesnet.query import MAX_SEED, ApproachCone, GraspQuery
@@ -346,26 +345,6 @@ def test_other_candidates_are_searched_for_while_the_best_score_is_low(monkeypat
     np.testing.assert_array_equal(predictor.predict(query).grasps.scores, first.grasps.scores)
 
 
-def test_candidates_agree_on_their_scores_where_the_configuration_says_so(monkeypatch: pytest.MonkeyPatch) -> None:
-    monkeypatch.setattr(predictor_module, "FURTHER_SEARCHES", 0)
-    query = tabletop_query(max_grasps=1000, max_candidates=400, separation_translation=0.0)
-    settings = configuration_of(fresh_network())
-    agreement = AgreementConfig(**settings.pop("agreement"))
-
-    def answer_of(configuration: dict[str, Any]) -> GraspSet:
-        asked = GraspPredictor(
-            fresh_network().eval(), configuration, (8.0, 0.5), predictor().model, torch.device("cpu")
-        )
-        return asked.predict(query).grasps
-
-    alone, together = answer_of(settings), answer_of(settings | {"agreement": asdict(agreement)})
-    assert len(alone.scores) == len(together.scores) > 50
-    poses, scores = torch.tensor(alone.Ts_cloud_grasp).float(), torch.tensor(alone.scores).float()
-    expected = torch.sigmoid(agreed(torch.logit(scores), poses, agreement)).sort(descending=True).values
-    np.testing.assert_allclose(together.scores, expected.numpy(), atol=1e-4)
-    assert np.abs(np.sort(alone.scores) - np.sort(together.scores)).max() > 1e-3
-
-
 # Loading
 
 
@@ -377,7 +356,7 @@ def test_a_saved_network_answers_like_the_one_in_memory(tmp_path: Path) -> None:
     np.testing.assert_array_equal(loaded.predict(tabletop_query()).grasps.scores, answer().grasps.scores)
     assert (loaded.model.name, loaded.model.version, loaded.model.card) == ("tesnet", "3", {"seed": 7})
     assert loaded.model.weights_sha256 == weights.sha256(tmp_path / "a.safetensors")
-    assert set(loaded.model.configuration) == {"network", "preparation", "candidates", "agreement"}
+    assert set(loaded.model.configuration) == {"network", "preparation", "candidates"}
 
 
 @pytest.mark.parametrize(
