@@ -12,7 +12,6 @@ from itertools import pairwise
 
 import numpy as np
 import numpy.typing as npt
-from scipy.spatial import ConvexHull
 
 from simharness.errors import UsageError
 from simharness.play.metrics import Rate
@@ -26,6 +25,8 @@ from simharness.sim.world import World
 
 def narrowest(corners: npt.NDArray[np.float64]) -> float:
     """The least distance between a face of the convex hull of corners (K, 3) and the corner farthest behind it."""
+    from scipy.spatial import ConvexHull  # noqa: PLC0415 - takes longer to import than all else here
+
     hull = ConvexHull(corners)
     heights = corners[hull.vertices] @ hull.equations[:, :3].T + hull.equations[:, 3]
     return float(-heights.min(axis=0).max())
