@@ -233,30 +233,41 @@ def _support_noise(
     reach = SUPPORT_NOISE if support is None else max(SUPPORT_NOISE, support.clearance)
     if config.smooth_above is None:
         return reach, 0.0
-    sd = _support_sd(points, query) if support is None else support.noise_sd
-    reach = max(reach, min(_DEVIATIONS * sd, MOST_SUPPORT_NOISE))
-    return _reach_of_seen(points, query, reach) if support is None else reach, sd
+    if support is not None:
+        return max(reach, min(_DEVIATIONS * support.noise_sd, MOST_SUPPORT_NOISE)), support.noise_sd
+    known = _heights(points, query)
+    if known is None:
+        return reach, 0.0
+    heights, support_height = known
+    over = heights - support_height
+    sd = _sd_under(over)
+    return _reach_of_seen(over, max(reach, min(_DEVIATIONS * sd, MOST_SUPPORT_NOISE))), sd
 
 
-def _support_sd(points: Tensor, query: GraspQuery) -> float:
-    """Standard deviation of the support's rows (N, 3 or more) about its known plane, by those under it; 0 if unseen."""
+def _heights(points: Tensor, query: GraspQuery) -> tuple[Tensor, float] | None:
+    """Heights (N,) along `up` of rows (N, 3 or more), and the support's; None where that is not known."""
     if query.known_up is None or not isinstance(query.support_height, float):
-        return 0.0
-    heights = points[:, :3] @ torch.tensor(query.known_up, dtype=points.dtype, device=points.device)
-    below = query.support_height - heights
+        return None
+    up = torch.tensor(query.known_up, dtype=points.dtype, device=points.device)
+    return points[:, :3] @ up, query.support_height
+
+
+def _sd_under(over: Tensor) -> float:
+    """Standard deviation of a support about its known height, by the heights (N,) over that of what is under it.
+
+    0 where it is not seen.
+    """
+    below = -over
     below = below[(below >= 0) & (below <= _NEAR_SUPPORT)]
     return 1.4826 * float(below.median()) if len(below) >= _FEWEST_BELOW else 0.0
 
 
-def _reach_of_seen(points: Tensor, query: GraspQuery, otherwise: float) -> float:
-    """How high the noise of a support reaches that rows (N, 3 or more) show on both sides of its known height.
+def _reach_of_seen(over: Tensor, otherwise: float) -> float:
+    """How high the noise of a support reaches that shows on both sides of its known height, by heights (N,) over that.
 
     So things of 3 to 5 mm are told from it. A support that lies somewhat beside that height looks noisier than it is.
     """
-    if query.known_up is None or not isinstance(query.support_height, float):
-        return otherwise
-    heights = points[:, :3] @ torch.tensor(query.known_up, dtype=points.dtype, device=points.device)
-    away = (heights - query.support_height).abs()
+    away = over.abs()
     away = away[away <= SUPPORT_NOISE]
     if len(away) < _FEWEST_BELOW:
         return otherwise
@@ -297,10 +308,11 @@ def _outward(query: GraspQuery) -> Tensor | None:
 
 def above_support(points: Tensor, query: GraspQuery, noise: float = SUPPORT_NOISE) -> Tensor:
     """Rows (N, 3 or more), beginning with x, y, z, that are not lower than a noise above the query's support plane."""
-    if query.known_up is None or not isinstance(query.support_height, float):
+    known = _heights(points, query)
+    if known is None:
         return points
-    heights = points[:, :3] @ torch.tensor(query.known_up, dtype=points.dtype, device=points.device)
-    return points[heights >= query.support_height + noise]
+    heights, support_height = known
+    return points[heights >= support_height + noise]
 
 
 def in_workspace(points: Tensor, query: GraspQuery) -> Tensor:

@@ -49,15 +49,18 @@ def sizes(
         raise UsageError(
             f"--objects {settings.objects}: sizes are known of {', '.join(SETS)}; give a run on one of them"
         )
+    made = SETS[settings.objects]
+    size_of: dict[str, float] = {}  # unscaled, of the things that were met so far
     found = []
     for record in rounds:
         with World() as world:
             placed = round_scene(world, settings, objects, record.seed, record.round).placed
         grasped = Counter(name for attempt in record.attempts for name in attempt.grasped)
         for thing in placed:
-            made = SETS[settings.objects].make(thing.name)
-            corners = np.concatenate([part.vertices for body in made.bodies for part in body.parts])
-            found.append((narrowest(corners) * thing.scale, grasped[thing.name] > 0))
+            if thing.name not in size_of:
+                parts = [part for body in made.make(thing.name).bodies for part in body.parts]
+                size_of[thing.name] = narrowest(np.concatenate([part.vertices for part in parts]))
+            found.append((size_of[thing.name] * thing.scale, grasped[thing.name] > 0))
             grasped[thing.name] -= 1
     return found
 

@@ -268,9 +268,9 @@ def test_of_a_support_that_is_seen_about_its_height_no_more_than_its_noise_is_dr
     things = rng.uniform([-0.06, -0.06, lowest], [0.06, 0.06, 0.06], (30_000, 3))
     table = np.column_stack([rng.uniform(-0.3, 0.3, (9000, 2)), beside + rng.normal(0, noise_sd, 9000)])
     query = ask(np.concatenate([things, table]), viewpoints=CAMERA, up=UP, support_height=0.0)
-    posted = torch.from_numpy(query.points.copy())
-    assert cloud._reach_of_seen(posted, query, 0.005) == pytest.approx(lowest, abs=4e-4)
-    assert cloud._reach_of_seen(torch.from_numpy(things).float(), query, 0.005) == 0.005
+    over = torch.from_numpy(query.points[:, 2].copy())
+    assert cloud._reach_of_seen(over, 0.005) == pytest.approx(lowest, abs=4e-4)
+    assert cloud._reach_of_seen(torch.from_numpy(things[:, 2]).float(), 0.005) == 0.005
     ready = prepared(query, smooth_above=0.05)
     heights = ready.T_cloud_canonical.apply(ready.points.numpy())[:, 2]
     assert float(heights.min()) == pytest.approx(lowest + 0.001, abs=0.0015)
