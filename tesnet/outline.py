@@ -39,10 +39,11 @@ _BESIDE = (0.007, 0.011, 0.015)
 """How far outside of an edge one looks for what lies beyond: past the pixel of the edge itself."""
 
 _DROP = 0.006
-"""What lies beyond an edge is at least so much farther away than the face, or"""
+"""What lies beyond an edge is at least so much farther away than the face."""
 
 _LOW_DROP, _LEAST_DROP = 0.6, 0.0015
-"""beyond that of a face nearer to the support so much of its height, but no less than the latter."""
+"""Beyond the edge of a low face it is this share of the face's height over the support, and no less than so many
+metres, where that is less than `_DROP`."""
 
 _WALL = 0.5
 """A neighbour belongs to the wall under an edge where the cosine of its normal with the edge's direction is more."""

@@ -43,12 +43,14 @@ def sizes(
         rounds: the recorded rounds.
 
     Raises:
-        UsageError: the objects come from files.
+        UsageError: the objects come from files, or no round was written yet.
     """
     if settings.objects not in SETS:
         raise UsageError(
             f"--objects {settings.objects}: sizes are known of {', '.join(SETS)}; give a run on one of them"
         )
+    if not rounds:
+        raise UsageError("the run has no round yet; wait for one, or go on with --resume")
     made = SETS[settings.objects]
     size_of: dict[str, float] = {}  # unscaled, of the things that were met so far
     found = []

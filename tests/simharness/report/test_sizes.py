@@ -57,3 +57,8 @@ def test_sizes_are_those_of_the_scene(make_settings: Any) -> None:
 def test_objects_from_files_have_no_size_here(make_settings: Any) -> None:
     with pytest.raises(UsageError, match="wide"):
         sizes(make_settings(objects="val.txt"), (), [])
+
+
+def test_a_run_without_rounds_has_no_sizes_yet(make_settings: Any) -> None:
+    with pytest.raises(UsageError, match="--resume"):
+        sizes(make_settings(objects="wide"), (), [])
