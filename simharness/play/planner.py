@@ -37,6 +37,7 @@ class HttpPlanner:
         transport: replaces the network, for tests.
         gripper: name of the hand to ask for.
         calibrate: whether the service shall calibrate by the table in view.
+        min_score: the least score of a grasp; None takes every one.
 
     Raises:
         UsageError: a URL that is not http or https.
@@ -51,6 +52,7 @@ class HttpPlanner:
         *,
         gripper: str = DEFAULT_HAND,
         calibrate: bool = False,
+        min_score: float | None = None,
     ) -> None:
         try:
             self._client = GraspClient(url, timeout=REQUEST_TIMEOUT_S, transport=transport)
@@ -60,8 +62,9 @@ class HttpPlanner:
         self._model = model
         self._max_grasps = max_grasps
         self._calibrate = calibrate
-        # Older services know no hand by name.
-        self._hand: dict[str, Any] = {} if gripper == DEFAULT_HAND else {"gripper": gripper}
+        self._always: dict[str, Any] = {"min_score": min_score}
+        if gripper != DEFAULT_HAND:  # older services know no hand by name
+            self._always["gripper"] = gripper
 
     def __enter__(self) -> Self:
         return self
@@ -84,7 +87,7 @@ class HttpPlanner:
         if not len(observation.points_world):
             return Plan.nothing("no_points_in_workspace")
         start = time.perf_counter()
-        options = _options(query_about(observation, seed, calibrate=self._calibrate)) | self._hand
+        options = _options(query_about(observation, seed, calibrate=self._calibrate)) | self._always
         try:
             reply = self._client.grasps(
                 observation.points_world,

@@ -187,7 +187,12 @@ def _play(
 
 def _planner(url: str, settings: RunSettings) -> HttpPlanner:
     return HttpPlanner(
-        url, settings.model, settings.max_grasps, gripper=settings.gripper, calibrate=bool(settings.calibrate)
+        url,
+        settings.model,
+        settings.max_grasps,
+        gripper=settings.gripper,
+        calibrate=bool(settings.calibrate),
+        min_score=settings.min_score,
     )
 
 

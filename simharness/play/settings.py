@@ -184,6 +184,17 @@ class RunSettings:
         ),
     ] = "franka"
 
+    min_score: Annotated[
+        float | None,
+        Flag(
+            "model",
+            "look again from elsewhere where no grasp scores as much, and end the round after three such looks "
+            "(default: every grasp is tried)",
+            "P",
+            within=Interval(0, 1, "a probability"),
+        ),
+    ] = None
+
     @property
     def hand(self) -> KnownHand:
         """The hand that `gripper` names."""

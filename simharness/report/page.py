@@ -39,6 +39,7 @@ _UNSET = {
     "distance": "the camera's own",
     "table_in_view": "with calibration",
     "calibrate": "no",
+    "min_score": "every grasp is tried",
     "url": "started for the run",
     "service_threads": "unknown",
     "device": "unknown",

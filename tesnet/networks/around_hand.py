@@ -18,7 +18,8 @@ Region = tuple[float, float, float, float]
 """Half extents along x and y, and extents along -z and +z from the TCP."""
 
 
-PROBES = 105
+PROBES, PROBES_IN_FINGERS = 105, 60
+"""Of a hand: in all, and how many of the first ones stand in the fingers."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -18,12 +18,12 @@ from torch import Tensor, nn
 from tesnet.candidates import Candidates, at_rest
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.layers import PointTransformerConv, SAGEConv
-from tesnet.networks.around_hand import PROBES, Region, ends, probes, region_about
+from tesnet.networks.around_hand import PROBES, PROBES_IN_FINGERS, Region, ends, probes, region_about
 from tesnet.networks.network import mirror_factors
 from tesnet.networks.told import TOLD_INPUTS, told_inputs
 from tesnet.patches import Patches, group, pool
 from tesnet.points import points_in_grasp_frames
-from tesnet.visibility import depth_behind, outside
+from tesnet.visibility import SHADOW_MARGIN, depth_behind, outside
 
 _POINT_INPUTS = 7
 _EDGE_INPUTS = 4
@@ -50,6 +50,9 @@ class TesNetConfig:
         around_patches, around_region: the same for patches in the hand's wider surroundings.
         probe_channels: width of the layer over what the camera saw at the hand's probes.
         told: whether it is told the hand and the cloud's noise (`told_inputs`). Without, it knows of them what it sees.
+        caution: log odds that a candidate would lose whose fingers stood wholly in what no camera saw; it loses the
+            part of them that stands there. Not in training: on things that fit into a hand, behind what is seen there
+            is nothing, and so a network learns; on things wider than the hand there is.
     """
 
     channels: int = 32
@@ -66,6 +69,7 @@ class TesNetConfig:
     around_patches: int = 48
     around_region: Region = (0.035, 0.085, 0.060, 0.045)
     told: bool = False
+    caution: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -172,17 +176,21 @@ class TesNet(nn.Module):
         closing = self.closing(features.points, cloud, at_fingers, poses, sign, of_closing)
         around = self.around(features.wide, features.patches, near_hand, poses, sign, of_around)
         totals = torch.stack([at_fingers.total, near_hand.total], dim=1)
+        behind = _depth_behind_probes(cloud, candidates, sign)
         joined = (
             self.pooled(torch.cat([closing, around], dim=1))
             + self.approach(features.points)[candidates.approach]
             + self.contact(features.points)[candidates.contact]
             + self.candidate(_candidate_inputs(cloud, candidates, totals, sign))
             + self.situation(features.context)
-            + self.hidden_space(_probe_inputs(cloud, candidates, sign))
+            + self.hidden_space(_probe_inputs(behind))
         )
         if of_head is not None:
             joined = joined + of_head
         logits: Tensor = self.head(joined)[:, 0]
+        if self.config.caution and not self.training:
+            unseen = behind[:, :PROBES_IN_FINGERS] > SHADOW_MARGIN
+            logits = logits - self.config.caution * unseen.float().mean(dim=1)
         return logits
 
 
@@ -385,10 +393,15 @@ def _candidate_inputs(cloud: PreparedCloud, candidates: Candidates, totals: Tens
     return torch.cat([pair[:, 1:] / _LENGTH, totals.float() / 100, normal, sight, up, height, out], 1)
 
 
-def _probe_inputs(cloud: PreparedCloud, candidates: Candidates, sign: Tensor) -> Tensor:
-    """(C, 2 PROBES): how far the hand's probes lie behind what the camera saw, on a coarse and on a fine scale."""
+def _depth_behind_probes(cloud: PreparedCloud, candidates: Candidates, sign: Tensor) -> Tensor:
+    """(C, PROBES): how far the hand's probes lie behind what the camera saw, metres, mirrored where `sign` is -1."""
     poses = candidates.Ts_canonical_grasp
     local = probes(candidates.gripper).of(candidates)
     places = (mirror_factors(sign)[:, None] * local) @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
-    behind = depth_behind(cloud, places) / _LENGTH
-    return torch.cat([behind.clamp(-2, 3), (4 * behind).clamp(-1, 1)], dim=1)
+    return depth_behind(cloud, places)
+
+
+def _probe_inputs(behind: Tensor) -> Tensor:
+    """(C, 2 PROBES): the depths (C, PROBES) on a coarse and on a fine scale."""
+    scaled = behind / _LENGTH
+    return torch.cat([scaled.clamp(-2, 3), (4 * scaled).clamp(-1, 1)], dim=1)

@@ -113,6 +113,21 @@ def test_the_service_is_told_to_calibrate_where_that_is_wanted() -> None:
     assert calibrating["calibrate"] == ["true"]
 
 
+def test_the_service_is_told_the_least_score_where_one_is_wanted() -> None:
+    seen: list[httpx.Request] = []
+
+    def reply(request: httpx.Request) -> httpx.Response:
+        seen.append(request)
+        return httpx.Response(200, json=answer(1))
+
+    for least in (None, 0.625):
+        with HttpPlanner("http://service.test", "tesnet", 1, httpx.MockTransport(reply), min_score=least) as asked:
+            asked.plan(observation(), seed=1)
+    plain, choosy = (parse_qs(request.url.query.decode()) for request in seen)
+    assert "min_score" not in plain
+    assert choosy["min_score"] == ["0.625"]
+
+
 def test_every_viewpoint_of_a_fused_cloud_is_sent() -> None:
     seen: list[httpx.Request] = []
 

@@ -151,7 +151,7 @@ def test_rounds_are_written_in_their_order_whatever_the_order_they_finish_in(
 
 
 def test_the_service_is_asked_as_the_settings_say(make_settings: Any, monkeypatch: pytest.MonkeyPatch) -> None:
-    settings = make_settings(model="gpd", max_grasps=7, gripper="rg2", calibrate=True)
+    settings = make_settings(model="gpd", max_grasps=7, gripper="rg2", calibrate=True, min_score=0.7)
     told: list[dict[str, Any]] = []
 
     def noted(*arguments: Any, **options: Any) -> None:
@@ -160,5 +160,13 @@ def test_the_service_is_asked_as_the_settings_say(make_settings: Any, monkeypatc
     monkeypatch.setattr(running, "HttpPlanner", noted)
     for asked in (settings, make_settings()):
         running._planner("http://service.test", asked)
-    expected = {"url": "http://service.test", "model": "gpd", "max_grasps": 7, "gripper": "rg2", "calibrate": True}
-    assert told == [expected, expected | {"model": "tesnet", "max_grasps": 1, "gripper": "franka", "calibrate": False}]
+    expected = {
+        "url": "http://service.test",
+        "model": "gpd",
+        "max_grasps": 7,
+        "gripper": "rg2",
+        "calibrate": True,
+        "min_score": 0.7,
+    }
+    plain = {"model": "tesnet", "max_grasps": 1, "gripper": "franka", "calibrate": False, "min_score": None}
+    assert told == [expected, expected | plain]

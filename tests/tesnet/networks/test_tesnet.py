@@ -9,16 +9,18 @@ import numpy as np
 import pytest
 import torch
 
-from tesnet import candidates, cloud
-from tesnet.candidates import Candidates
+from tesnet import candidates, cloud, visibility
+from tesnet.candidates import Candidates, at_rest
 from tesnet.geometry import Pose
 from tesnet.hands import HANDS
 from tesnet.networks import encode
+from tesnet.networks.around_hand import PROBES_IN_FINGERS, probes
 from tesnet.networks.tesnet import (
     CloudFeatures,
     TesNet,
     TesNetConfig,
     _candidate_inputs,
+    _depth_behind_probes,
     _probe_inputs,
     edge_features,
     point_inputs,
@@ -180,13 +182,41 @@ def test_a_mirrored_candidate_sees_what_it_would_see_of_the_reflected_scene() ->
         pose = single.Ts_canonical_grasp
         twin = reflected(ready, pose[0, :3, 3], pose[0, :3, 0])
         pairs.append(_candidate_inputs(twin, single, totals[:1], one[:1]))
-        hidden.append(_probe_inputs(twin, single, one[:1]))
+        hidden.append(_depth_behind_probes(twin, single, one[:1]).clamp(-0.04, 0.06))
     seen = [_candidate_inputs(ready, few, totals, sign * one) for sign in (-1, 1)]
     torch.testing.assert_close(seen[0], torch.cat(pairs), atol=1e-4, rtol=0)
     assert ((seen[0] - seen[1]).abs() > 1e-3).any(dim=1).all()
     # The pixels of what was seen lie otherwise in the reflected scene.
-    mirrored, plain = (_probe_inputs(ready, few, sign * one) for sign in (-1, 1))
+    mirrored, plain = (_depth_behind_probes(ready, few, sign * one).clamp(-0.04, 0.06) for sign in (-1, 1))
     assert (mirrored - torch.cat(hidden)).abs().mean() < 0.3 * (plain - torch.cat(hidden)).abs().mean()
+
+
+def test_depths_behind_what_was_seen_are_told_coarsely_and_finely() -> None:
+    behind = torch.tensor([[-torch.inf, -0.041, -0.001, 0.0, 0.004, 0.02, 0.061, torch.inf]])
+    coarse, fine = _probe_inputs(behind).split(8, dim=1)
+    torch.testing.assert_close(coarse, torch.tensor([[-2.0, -2.0, -0.05, 0.0, 0.2, 1.0, 3.0, 3.0]]))
+    torch.testing.assert_close(fine, torch.tensor([[-1.0, -1.0, -0.2, 0.0, 0.8, 1.0, 1.0, 1.0]]))
+
+
+@torch.inference_mode()
+def test_caution_takes_log_odds_by_the_part_of_the_fingers_that_no_camera_saw_but_not_in_training() -> None:
+    ready, found = example()
+    careful = TesNet(replace(fresh_network().config, caution=8.0))
+    careful.load_state_dict(fresh_network().state_dict())
+    poses = at_rest(ready, found).Ts_canonical_grasp
+    finger = probes(found.gripper).of(at_rest(ready, found))[:, :PROBES_IN_FINGERS]
+    hand = found.gripper.parts
+    for one in finger[0]:  # every one of them does stand in a finger, and none in the palm
+        assert min(abs(one[0]), hand[0].breadth.full / 2) == abs(one[0])
+        assert abs(one[1]) > found.gripper.max_width / 2
+        assert hand[0].back <= one[2] <= hand[0].front
+    places = finger @ poses[:, :3, :3].transpose(1, 2) + poses[:, None, :3, 3]
+    share = visibility.hidden(ready, places).float().mean(dim=1)
+    assert (share == 0).any()
+    assert (share > 0.2).any()
+    expected = score(found) - 8.0 * share
+    torch.testing.assert_close(careful.eval().score(features(), ready, found), expected, atol=1e-5, rtol=0)
+    torch.testing.assert_close(careful.train().score(features(), ready, found), score(found), atol=1e-5, rtol=0)
 
 
 def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
