@@ -2,12 +2,21 @@
 
 from __future__ import annotations
 
+import asyncio
 import select
 from collections.abc import Callable, Iterator
 from typing import Any
 
 import httpx
+import pytest
+from fastapi import Request
+from hypothesis import given
+from hypothesis import strategies as st
+from starlette.types import Message
 
+from service.errors import TooLarge
+from service.intake import read_body
+from service.memory import Memory
 from tests.conftest import PATIENCE_S
 from tests.service.wire import OCTETS, post, post_head, problem_of, status_of
 
@@ -57,3 +66,27 @@ def test_a_client_that_sends_a_too_large_body_to_its_end_reads_the_413(http: htt
             yield bytes(2**20)
 
     problem_of(http.post("/grasps", content=body(), headers=OCTETS), 413, "67108864")
+
+
+@given(sizes=st.lists(st.integers(0, 40), max_size=8), announced=st.booleans())
+def test_a_body_is_read_up_to_the_last_byte_of_the_limit_however_it_comes(sizes: list[int], announced: bool) -> None:
+    chunks = [bytes([number]) * size for number, size in enumerate(sizes)]
+    whole = b"".join(chunks)
+
+    def read(limit: int) -> bytes:
+        left = [{"type": "http.request", "body": chunk, "more_body": True} for chunk in chunks]
+        left.append({"type": "http.request", "body": b"", "more_body": False})
+
+        async def receive() -> Message:
+            return left.pop(0)
+
+        headers = [(b"content-length", str(len(whole)).encode())] if announced else []
+        with Memory(1e6).share() as share:
+            body = asyncio.run(read_body(Request({"type": "http", "headers": headers}, receive), limit, share))
+            assert share.size == len(body)
+        return bytes(body)
+
+    assert read(len(whole)) == read(len(whole) + 1) == whole
+    if whole:
+        with pytest.raises(TooLarge, match=f"{len(whole) - 1}"):
+            read(len(whole) - 1)

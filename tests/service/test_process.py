@@ -17,6 +17,9 @@ import httpx
 import numpy as np
 import pytest
 
+from service import process
+from service.protocol import KEEP_ALIVE_SECONDS
+from service.settings import load_settings
 from tesnet.weights import SUMS, default_weights
 from tests.conftest import PATIENCE_S, SERVED_HERE, hears
 from tests.service.wire import status_of
@@ -181,3 +184,23 @@ def test_standard_files_that_nobody_opened_stop_nothing(closed: str) -> None:
         )
         assert ended.returncode == 2
         assert b"Traceback" not in ended.stderr
+
+
+@pytest.mark.parametrize("proxies", ["", "10.9.9.9", "127.0.0.1, 10.0.0.0/8"])
+def test_the_server_is_set_up_as_the_settings_say(proxies: str, monkeypatch: pytest.MonkeyPatch) -> None:
+    """Who is trusted for addresses above all: uvicorn by itself believes whoever asks from this machine."""
+    made: list[process._Server] = []
+    monkeypatch.setattr(process._Server, "run", lambda server, sockets: made.append(server))
+    settings = load_settings({**SERVED_HERE, "GRASP_TRUSTED_PROXIES": proxies, "GRASP_DRAIN_TIMEOUT": "7"})
+    with socket.create_server(("127.0.0.1", 0)) as listener, pytest.MonkeyPatch.context() as patch:
+        patch.setattr(os, "_exit", lambda code: None)
+        process._serve(settings, listener, 0.0)
+    config = made[0].config
+    trusted = [name for name in proxies.split(", ") if name]
+    assert (config.proxy_headers, config.forwarded_allow_ips) == (bool(trusted), trusted)
+    assert (config.timeout_keep_alive, config.timeout_graceful_shutdown, config.ws) == (
+        KEEP_ALIVE_SECONDS,
+        process.LAST_BYTES_SECONDS,
+        "none",
+    )
+    assert (config.access_log, config.server_header, made[0]._drain_timeout) == (False, False, 7.0)

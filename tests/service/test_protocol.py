@@ -142,3 +142,18 @@ def test_heads_that_never_end_are_counted(serve: Serve, eventually: Eventually) 
         connection.sendall(b"GET / HTTP/1.1\r\nHost: test\r\n" + b"X-Long: aaaa\r\n" * 700)
         eventually(lambda: server.memory.held >= 9_800)
     eventually(lambda: server.memory.held == 0)
+
+
+def test_a_head_that_comes_in_pieces_counts_for_all_of_them(serve: Serve, eventually: Eventually) -> None:
+    server = serve()
+    sent = 0
+
+    def all_counted() -> bool:
+        return bool(server.memory.held == sent)
+
+    with connect(server.url) as connection:
+        for piece in (b"GET / HTTP/1.1\r\nHost: test\r\n", b"X-Long: aaaa\r\n" * 300, b"X-Longer: bbb\r\n" * 200, b"X"):
+            connection.sendall(piece)
+            sent += len(piece)
+            eventually(all_counted)
+    eventually(lambda: server.memory.held == 0)

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -126,3 +127,16 @@ def test_a_run_that_breaks_off_ends_the_command_and_keeps_what_was_compared(
     content = json.loads((tmp_path / "table2.json").read_text())
     assert content["complete"] is False
     assert list(content["conditions"]["packed-edge"]) == ["heuristic"]
+
+
+def test_published_figures_stand_beside_the_executor_that_they_were_measured_with(
+    trials: list[Trial], make_round: Any
+) -> None:
+    strict = [replace(trial, settings=replace(trial.settings, executor="strict")) for trial in trials]
+    tables = []
+    for each in (trials, strict):
+        comparison = Comparison(each)
+        for trial in each:
+            comparison.add(trial.name, finished(trial, make_round))
+        tables.append(comparison.table())
+    assert ["90.6 / 92.2" in table for table in tables] == [True, False]

@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
+from dataclasses import asdict
 from pathlib import Path
 from typing import Any
 
@@ -95,3 +96,30 @@ def test_the_command_plays_the_same_tables_in_every_condition_and_resumes(
     # Finished conditions are not played again: nobody serves there.
     assert main([*command, "--url", "http://127.0.0.1:9", "--resume"]) == 0
     assert json.loads((tmp_path / "robustness.json").read_text()) == content
+
+
+@pytest.mark.parametrize("condition", conditions(AXIS_NAMES), ids=lambda condition: condition.name)
+def test_a_condition_changes_what_its_name_tells_and_nothing_else(condition: Condition, make_settings: Any) -> None:
+    expected: dict[str, Any] = {}
+    name = condition.name
+    if name.endswith("-calibrated"):
+        expected["calibrate"], name = True, name.removesuffix("-calibrated")
+    if name.startswith(("d435-", "d415-")):
+        expected["sensor"], name = name.split("-", 1)
+    kind, _, level = name.partition("-")
+    if kind == "polar":
+        expected["polar_deg"] = float(level.removesuffix("deg"))
+    elif kind in ("distance", "voxel"):
+        field = {"distance": "distance", "voxel": "voxel_size"}[kind]
+        expected[field] = pytest.approx(float(level.removesuffix("mm")) / 1000)
+    elif kind == "sensor":
+        expected["sensor"] = level
+    elif kind == "noise":
+        expected |= (
+            {"noise_std": 0.0, "dex_noise": True}
+            if level == "giga"
+            else {"noise_std": float(level.removesuffix("mm")) / 1000}
+        )
+    else:
+        assert condition.name == "unchanged"
+    assert asdict(condition.settings(make_settings())) == asdict(make_settings()) | expected

@@ -1,5 +1,6 @@
 """What a run cleared, by size: things are as narrow as they are, and each is counted once."""
 
+from dataclasses import replace
 from pathlib import Path
 from typing import Any
 
@@ -62,3 +63,15 @@ def test_objects_from_files_have_no_size_here(make_settings: Any) -> None:
 def test_a_run_without_rounds_has_no_sizes_yet(make_settings: Any) -> None:
     with pytest.raises(UsageError, match="--resume"):
         sizes(make_settings(objects="wide"), (), [])
+
+
+def test_of_several_things_alike_as_many_count_as_were_grasped(make_settings: Any) -> None:
+    settings = make_settings(scene="pile", objects="wide", rounds=1)
+    alike = load_object_set("wide", "pile")[:1]
+    record = play_round(settings, alike, TopDown(), 0, 0)
+    assert len(set(record.objects)) == 1
+    name = record.objects[0]
+    once = replace(record, attempts=(replace(record.attempts[0], grasped=(name,)),))
+    for number in range(len(record.objects) + 1):
+        found = sizes(settings, alike, [replace(record, attempts=once.attempts * number)])
+        assert sum(taken for _, taken in found) == number

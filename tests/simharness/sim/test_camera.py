@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import math
 from collections.abc import Iterator
+from typing import Any
 
 import numpy as np
 import pytest
@@ -13,6 +14,7 @@ from simharness.sim.camera import (
     INTRINSICS,
     NEAR,
     PRESETS,
+    Observation,
     Preset,
     Stand,
     observe,
@@ -290,3 +292,20 @@ def test_presets_of_chance_fill_their_ranges_and_views_of_one_stand_evenly_about
             assert (radius, polar) == pytest.approx(found[0][:2])
             turned = (azimuth - found[0][2] - 120 * number) % 360
             assert min(turned, 360 - turned) == pytest.approx(0, abs=1e-6)
+
+
+def test_what_is_asked_of_a_view_reaches_it(world: World) -> None:
+    def seen(**options: Any) -> Observation:
+        return observe(world, "random", np.random.default_rng(3), Sensor(), **options)
+
+    plain = seen()
+    assert (plain.images[0].segmentation == -1).all()
+    thinned = len(thin(plain.points_world, 0.01))
+    assert len(seen(voxel_size=0.01).points_world) == pytest.approx(thinned, rel=0.02)
+    assert thinned < len(plain.points_world) / 3
+    assert (seen(segmentation=True).images[0].segmentation >= 0).any()
+    assert len(seen(table_in_view=True).points_world) > 2 * len(plain.points_world)
+    stand = Stand(40.0, 0.5)
+    np.testing.assert_allclose(
+        seen(stand=stand).viewpoints, [sample_camera("random", np.random.default_rng(3), stand)[0].translation]
+    )
