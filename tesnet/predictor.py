@@ -14,6 +14,7 @@ import numpy as np
 import torch
 
 from tesnet import calibration, candidates, cloud, collision, networks, notices, ranking, support, weights
+from tesnet.doubt import log_odds_lost
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import GraspSet, Pose
 from tesnet.networks import Network
@@ -189,7 +190,7 @@ class GraspPredictor:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""
         clock = _Clock(give_up)
         rejected = dict.fromkeys(REJECTIONS, 0)
-        query, corrected = calibration.calibrated(query)
+        query, corrected, doubt = calibration.calibrated(query)
         query, plane, said = support.settled(query)
         notes = [
             *notices.of_query(query, knows_hands=self._network.knows_hands),
@@ -220,7 +221,7 @@ class GraspPredictor:
             sizes = (len(prepared), found.count, 0)
             notes += notices.of_answer(0.0, prepared, query)
             return _nothing(query, reason, sizes, rejected | found.rejected, notes, clock)
-        return _Proposal(query, prepared, edges, found, notes, clock)
+        return _Proposal(query, prepared, edges, found, notes, clock, doubt)
 
     def _search(
         self, prepared: cloud.PreparedCloud, query: GraspQuery, edges: Callable[[], Outline], clock: _Clock
@@ -270,7 +271,7 @@ class GraspPredictor:
         With the scores (C,) of its free candidates.
         """
         query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
-        found, scores = proposal.found, self._scores(features, prepared, proposal.found, clock)
+        found, scores = proposal.found, self._scores(features, proposal, proposal.found)
         clock.lap("network")
         for number in range(1, FURTHER_SEARCHES + 1):
             # Where a search yields few candidates it has tried every approach point.
@@ -281,20 +282,22 @@ class GraspPredictor:
             self._synchronise()
             clock.lap("candidates")
             if len(other.free):
-                other_scores = self._scores(features, prepared, other, clock)
+                other_scores = self._scores(features, proposal, other)
                 if float(other_scores.max()) > float(scores.max()):
                     found, scores = other, other_scores
                 clock.lap("network")
         return found, scores
 
-    def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Free, clock: _Clock) -> torch.Tensor:
+    def _scores(self, features: Any, proposal: _Proposal, found: _Free) -> torch.Tensor:
         """(F,) of the free candidates, of which so many are scored together that the clock is looked at often."""
         a, b = self._calibration
-        logits = []
+        log_odds = []
         for rows in torch.arange(len(found.free), device=self.device).split(self._network.scored_at_once):
-            clock.check()
-            logits.append(self._network.score(features, prepared, found.free.select(rows)))
-        scores = torch.sigmoid(a * torch.cat(logits) + b)
+            proposal.clock.check()
+            some = found.free.select(rows)
+            logits = self._network.score(features, proposal.prepared, some)
+            log_odds.append(a * logits + b - log_odds_lost(proposal.prepared, some, proposal.doubt))
+        scores = torch.sigmoid(torch.cat(log_odds))
         self._synchronise()
         return scores
 
@@ -368,6 +371,7 @@ class _Proposal:
         found: at least one candidate without collision.
         notes: warnings for the answer.
         clock: the time of its stages.
+        doubt: how far from their places its points may be, metres.
     """
 
     query: GraspQuery
@@ -376,6 +380,7 @@ class _Proposal:
     found: _Free
     notes: list[str]
     clock: _Clock
+    doubt: float
 
 
 def _ranked(found: _Free, scores: torch.Tensor, query: GraspQuery) -> ranking.Ranking:
