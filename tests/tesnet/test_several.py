@@ -1,10 +1,12 @@
 from __future__ import annotations
 
 from dataclasses import replace
+from functools import partial
 
 import pytest
 
 from tesnet import weights
+from tesnet.errors import GaveUp
 from tesnet.predictor import GraspPredictor
 from tesnet.several import GraspPredictors
 from tests.tesnet.scenes import tabletop_query
@@ -29,6 +31,26 @@ def test_a_mixed_batch_is_answered_by_the_network_that_each_query_names(
         assert answer.grasps.scores == pytest.approx(expected.scores, abs=1e-5)
         assert answer.grasps.contact_points == pytest.approx(expected.contact_points)
     assert answers[0].grasps.scores[0] != answers[1].grasps.scores[0]
+
+
+def test_each_query_keeps_its_own_patience_whichever_network_answers(
+    each: tuple[GraspPredictor, GraspPredictor],
+) -> None:
+    query = tabletop_query(max_candidates=200)
+    names = ("heuristic", "tesnet", "heuristic", "tesnet")
+    asked = [0] * len(names)
+
+    def patient(place: int) -> bool:
+        asked[place] += 1
+        return False
+
+    queries = [replace(query, model=name) for name in names]
+    GraspPredictors(each).predict_batch(queries, [partial(patient, place) for place in range(len(names))])
+    assert min(asked) > 0
+    for place in range(len(names)):
+        patience = [None] * len(names)
+        with pytest.raises(GaveUp):
+            GraspPredictors(each).predict_batch(queries, [*patience[:place], lambda: True, *patience[place + 1 :]])
 
 
 def test_the_networks_are_named_in_order_and_a_network_without_weights_has_no_checksum(
