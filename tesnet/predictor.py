@@ -195,6 +195,7 @@ class GraspPredictor:
         notes = [
             *notices.of_query(query, knows_hands=self._network.knows_hands),
             *corrected,
+            *notices.of_doubt(doubt),
             *said,
             *notices.of_support(query),
         ]

@@ -236,7 +236,10 @@ def test_scores_in_doubt_are_less_by_what_the_nearness_of_the_fingers_costs() ->
     corrected, _, doubt = calibrated(shown)
     assert doubt > 0.005
     queries = (corrected.but(calibrate=False), shown)
-    plain, careful = (log_odds_of_poses(predictor.predict(query).grasps) for query in queries)
+    answers = [predictor.predict(query) for query in queries]
+    said = [[note for note in answer.warnings if f"be {1000 * doubt:.0f} mm off" in note] for answer in answers]
+    assert [len(notes) for notes in said] == [0, 1]
+    plain, careful = (log_odds_of_poses(answer.grasps) for answer in answers)
     assert plain.keys() == careful.keys()
     less = np.array([plain[pose] - careful[pose] for pose in plain])
     assert len(less) > 20
