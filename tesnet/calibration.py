@@ -33,6 +33,8 @@ where they are normal; of a slice through things, which has no plane, hardly mor
 MOST_BELOW = 0.05
 """Of the plane's own points: so many others may lie just below it; more, and things stand on another one."""
 
+_UNSHOWN = 1.5
+"""What a plane does not show of a wrong pose, as a multiple of what it shows (`training/NOTES.md`)."""
 _SAMPLE = 10_000
 _FEWEST = 200
 _WIDER = 3.0
@@ -74,10 +76,11 @@ class Correction:
     def doubt(self, points: NDArray[np.floating]) -> float:
         """How far from their places points (N, 3) of the view may still be, metres.
 
-        A camera that the plane shows to be turned is likely turned as far about the plane's normal, which leaves no
-        trace there.
+        A camera that the plane shows to be turned is likely turned about the plane's normal and moved along it too,
+        which leaves no trace there: half as much again is allowed for both together.
         """
-        return float(np.deg2rad(self.tilt_deg) * np.median(np.linalg.norm(points - self.viewpoint, axis=1)))
+        turned = np.deg2rad(self.tilt_deg) * np.median(np.linalg.norm(points - self.viewpoint, axis=1))
+        return float(_UNSHOWN * turned)
 
     def apply(self, points: NDArray[np.floating]) -> Array:
         """Where points (N, 3) of the view belong."""

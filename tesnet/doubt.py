@@ -12,22 +12,25 @@ from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.points import points_in_grasp_frames
 
-LEAST_DOUBT, MOST_DOUBT = 0.001, 0.012
+LEAST_DOUBT, MOST_DOUBT = 0.001, 0.015
 """Metres: less is noise, and to keep away further than the latter would leave no grasp on most things."""
 
 LOG_ODDS = 5.0
 """What a candidate loses whose fingers touch what is seen."""
 
 
-def log_odds_lost(cloud: PreparedCloud, candidates: Candidates, doubt: float) -> Tensor:
-    """(C,) what candidates lose for being nearer than `doubt` metres to what is seen: the less, the further away.
+def doubted(scores: Tensor, cloud: PreparedCloud, candidates: Candidates, doubt: float) -> Tensor:
+    """Scores (C,) of candidates where what is seen may stand up to `doubt` metres elsewhere.
 
-    A network knows no such doubt: it takes points to be where they are.
+    The nearer the fingers are to what is seen, the more they lose; nothing where they are further away than that. A
+    network knows no such doubt: it takes points to be where they are.
     """
     if doubt < LEAST_DOUBT:
-        return torch.zeros(len(candidates), device=cloud.points.device)
+        return scores
     near = distance_of_fingers(cloud, candidates) / min(doubt, MOST_DOUBT)
-    return LOG_ODDS * (1 - near.clamp(max=1))
+    odds = scores * torch.exp(LOG_ODDS * (near.clamp(max=1) - 1))
+    lowered: Tensor = odds / (1 - scores + odds)
+    return lowered
 
 
 def distance_of_fingers(cloud: PreparedCloud, candidates: Candidates) -> Tensor:

@@ -14,7 +14,7 @@ import numpy as np
 import torch
 
 from tesnet import calibration, candidates, cloud, collision, networks, notices, ranking, support, weights
-from tesnet.doubt import log_odds_lost
+from tesnet.doubt import doubted
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import GraspSet, Pose
 from tesnet.networks import Network
@@ -250,6 +250,7 @@ class GraspPredictor:
         clock.start()
         clock.check()
         found, scores = self._best_search(proposal, features)
+        scores = doubted(scores, prepared, found.free, proposal.doubt)
         posted = torch.from_numpy(query.points.copy()).to(self.device)
         posted = cloud.in_canonical_frame(posted, prepared.T_cloud_canonical)
         found, scores, ranked = _ranked_clear(posted, found, scores, query, clock)
@@ -272,7 +273,7 @@ class GraspPredictor:
         With the scores (C,) of its free candidates.
         """
         query, prepared, clock = proposal.query, proposal.prepared, proposal.clock
-        found, scores = proposal.found, self._scores(features, proposal, proposal.found)
+        found, scores = proposal.found, self._scores(features, prepared, proposal.found, clock)
         clock.lap("network")
         for number in range(1, FURTHER_SEARCHES + 1):
             # Where a search yields few candidates it has tried every approach point.
@@ -283,22 +284,20 @@ class GraspPredictor:
             self._synchronise()
             clock.lap("candidates")
             if len(other.free):
-                other_scores = self._scores(features, proposal, other)
+                other_scores = self._scores(features, prepared, other, clock)
                 if float(other_scores.max()) > float(scores.max()):
                     found, scores = other, other_scores
                 clock.lap("network")
         return found, scores
 
-    def _scores(self, features: Any, proposal: _Proposal, found: _Free) -> torch.Tensor:
+    def _scores(self, features: Any, prepared: cloud.PreparedCloud, found: _Free, clock: _Clock) -> torch.Tensor:
         """(F,) of the free candidates, of which so many are scored together that the clock is looked at often."""
         a, b = self._calibration
-        log_odds = []
+        logits = []
         for rows in torch.arange(len(found.free), device=self.device).split(self._network.scored_at_once):
-            proposal.clock.check()
-            some = found.free.select(rows)
-            logits = self._network.score(features, proposal.prepared, some)
-            log_odds.append(a * logits + b - log_odds_lost(proposal.prepared, some, proposal.doubt))
-        scores = torch.sigmoid(torch.cat(log_odds))
+            clock.check()
+            logits.append(self._network.score(features, prepared, found.free.select(rows)))
+        scores = torch.sigmoid(a * torch.cat(logits) + b)
         self._synchronise()
         return scores
 

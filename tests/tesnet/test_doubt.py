@@ -12,7 +12,7 @@ import torch
 
 from tesnet import cloud
 from tesnet.candidates import CandidateConfig, Candidates, generate
-from tesnet.doubt import LEAST_DOUBT, LOG_ODDS, MOST_DOUBT, distance_of_fingers, log_odds_lost
+from tesnet.doubt import LEAST_DOUBT, LOG_ODDS, MOST_DOUBT, distance_of_fingers, doubted
 from tesnet.hands import HANDS
 from tests.tesnet.scenes import prepared, tabletop_query
 
@@ -45,17 +45,25 @@ def test_distances_are_those_of_each_point_from_each_finger(hand: str) -> None:
         assert float(measured[number]) == pytest.approx(nearest, abs=1e-5)
 
 
+def log_odds(scores: torch.Tensor) -> torch.Tensor:
+    return torch.logit(scores.double())
+
+
 @pytest.mark.parametrize("doubt", [LEAST_DOUBT, 0.004, MOST_DOUBT, 0.05])
 def test_who_touches_loses_all_and_who_keeps_away_as_far_as_is_doubted_nothing(doubt: float) -> None:
     ready, found = example()
-    lost, away = log_odds_lost(ready, found, doubt), distance_of_fingers(ready, found)
-    counted = min(doubt, MOST_DOUBT)
-    assert (lost[away >= counted] == 0).all()
-    torch.testing.assert_close(lost[away < counted], LOG_ODDS * (1 - away[away < counted] / counted))
-    assert lost.max() <= LOG_ODDS
+    scores = torch.linspace(0.02, 0.98, len(found))
+    lost = log_odds(scores) - log_odds(doubted(scores, ready, found, doubt))
+    away, counted = distance_of_fingers(ready, found).double(), min(doubt, MOST_DOUBT)
+    expected = LOG_ODDS * (1 - (away / counted).clamp(max=1))
+    torch.testing.assert_close(lost, expected, atol=1e-4, rtol=0)
+    assert (expected > 1).any()
 
 
-def test_what_is_no_more_than_noise_costs_nothing() -> None:
+def test_what_is_no_more_than_noise_changes_no_bit_and_certain_scores_stay_within_their_limits() -> None:
     ready, found = example()
-    assert (log_odds_lost(ready, found, LEAST_DOUBT * 0.99) == 0).all()
-    assert (log_odds_lost(ready, found, 0.01) > 0).any()
+    scores = torch.linspace(0.0, 1.0, len(found))
+    assert torch.equal(doubted(scores, ready, found, LEAST_DOUBT * 0.99), scores)
+    after = doubted(scores, ready, found, 0.01)
+    assert (after[0], after[-1]) == (0, 1)
+    assert (after <= scores).all()

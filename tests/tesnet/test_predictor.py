@@ -511,7 +511,7 @@ def test_the_search_with_the_best_score_is_answered_whichever_it_was(
     factors = [0.3, 0.5, 0.4, 0.6, 0.2]
     factors[best] = 0.8
 
-    def scripted(features: Any, proposal: Any, searched: Any) -> torch.Tensor:
+    def scripted(features: Any, prepared: Any, searched: Any, clock: Any) -> torch.Tensor:
         told.append(torch.linspace(0.5, 1.0, len(searched.free)) * factors[len(told)])
         return told[-1]
 
