@@ -15,7 +15,7 @@ from tesnet.points import points_in_grasp_frames
 LEAST_DOUBT, MOST_DOUBT = 0.001, 0.015
 """Metres: less is noise, and to keep away further than the latter would leave no grasp on most things."""
 
-LOG_ODDS = 5.0
+LOG_ODDS = 3.0
 """What a candidate loses whose fingers touch what is seen."""
 
 
