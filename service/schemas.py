@@ -226,8 +226,7 @@ class GraspOptions(RequestPart):
         default=False,
         description="Solve each view's depth scale and a small tilt from the support that it sees, whose `up` and "
         "`support_height` must be known, and correct its points about its `viewpoint` before anything else. "
-        "`warnings` says what was corrected, or why nothing was. Where a camera was turned, it may be turned as far in "
-        "what the table does not show: hands that keep away from what is seen by as much are then preferred.",
+        "`warnings` says what was corrected, or why nothing was.",
     )
     pregrasp_distance: float = Field(
         default=0.05, ge=0, le=1, description="How far behind the grasp `pregrasp` lies, metres, 0 to 1."

@@ -2,8 +2,7 @@
 
 A camera whose depth is wrong by a factor, or that is turned a little, sees a known plane at another height and aslant.
 The factor and the turn about the camera that bring the plane back are applied to everything that it sees. What moves
-the camera along the plane, or turns it about the plane's normal, leaves no trace there and stays: `doubt` is a guess at
-it, for hands to keep away so far.
+the camera along the plane, or turns it about the plane's normal, leaves no trace there and stays.
 
 Knows no candidate and no network. numpy only; lengths in metres.
 """
@@ -11,7 +10,6 @@ Knows no candidate and no network. numpy only; lengths in metres.
 from __future__ import annotations
 
 from dataclasses import dataclass, replace
-from typing import NamedTuple
 
 import numpy as np
 from numpy.typing import NDArray
@@ -33,8 +31,6 @@ where they are normal; of a slice through things, which has no plane, hardly mor
 MOST_BELOW = 0.05
 """Of the plane's own points: so many others may lie just below it; more, and things stand on another one."""
 
-_UNSHOWN = 1.5
-"""What a plane does not show of a wrong pose, as a multiple of what it shows (`training/NOTES.md`)."""
 _SAMPLE = 10_000
 _FEWEST = 200
 _WIDER = 3.0
@@ -73,61 +69,37 @@ class Correction:
         """Whether it is one that a camera can need."""
         return abs(self.scale - 1) <= MOST_SCALE and self.tilt_deg <= MOST_TILT_DEG
 
-    def doubt(self, points: NDArray[np.floating]) -> float:
-        """How far from their places points (N, 3) of the view may still be, metres.
-
-        A camera that the plane shows to be turned is likely turned about the plane's normal and moved along it too,
-        which leaves no trace there: half as much again is allowed for both together.
-        """
-        turned = np.deg2rad(self.tilt_deg) * np.median(np.linalg.norm(points - self.viewpoint, axis=1))
-        return float(_UNSHOWN * turned)
-
     def apply(self, points: NDArray[np.floating]) -> Array:
         """Where points (N, 3) of the view belong."""
         turned: Array = self.viewpoint + self.scale * ((points - self.viewpoint) @ self.rotation.T)
         return turned
 
 
-class Calibrated(NamedTuple):
-    """A query as it is after `calibrated`.
-
-    Args:
-        query: with its points corrected.
-        notes: what is to be said of it.
-        doubt: how far from their places points may still be, metres, because the plane does not tell.
-    """
-
-    query: GraspQuery
-    notes: list[str]
-    doubt: float = 0.0
-
-
-def calibrated(query: GraspQuery) -> Calibrated:
+def calibrated(query: GraspQuery) -> tuple[GraspQuery, list[str]]:
     """The query with its points corrected view by view, if it asks for that; and what is to be said of it.
 
     A view whose correction cannot be found, or is not plausible, stays as it is.
     """
     if not query.calibrate:
-        return Calibrated(query, [])
+        return query, []
     known = _known(query)
     if isinstance(known, str):
-        return Calibrated(query, [f"calibrate: {known}; {_KEPT}"])
+        return query, [f"calibrate: {known}; {_KEPT}"]
     up, height, viewpoints = known
     points = query.points.astype(np.float64)
     normals = None if query.normals is None else query.normals.astype(np.float64)
-    notes, doubt = [], 0.0
+    notes = []
     for view, viewpoint in enumerate(viewpoints):
         seen = np.ones(len(points), dtype=bool) if query.view_index is None else query.view_index == view
         found = correction(points[seen], viewpoint, up, height)
         name = f"calibrate, view {view}" if len(viewpoints) > 1 else "calibrate"
         notes.append(f"{name}: {found if isinstance(found, str) else _figures(found)}")
         if isinstance(found, Correction):
-            doubt = max(doubt, found.doubt(points[seen]))
             points[seen] = found.apply(points[seen])
             if normals is not None:
                 normals[seen] = normals[seen] @ found.rotation.T
     turned = None if normals is None else normals.astype(np.float32)
-    return Calibrated(replace(query, points=points.astype(np.float32), normals=turned), notes, doubt)
+    return replace(query, points=points.astype(np.float32), normals=turned), notes
 
 
 def correction(points: Array, viewpoint: Array, up: Array, height: float) -> Correction | str:

@@ -9,7 +9,6 @@ import numpy as np
 
 from tesnet import plausibility
 from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, PreparedCloud
-from tesnet.doubt import LEAST_DOUBT, MOST_DOUBT
 from tesnet.geometry import PANDA, Box
 from tesnet.points import nearest_neighbours
 from tesnet.query import NO_VIEWPOINT, GraspQuery
@@ -28,14 +27,6 @@ def of_query(query: GraspQuery, *, knows_hands: bool) -> list[str]:
     if query.gripper != PANDA and not knows_hands:
         notes.append("gripper is not the hand that the network was trained with: only collision and width follow it")
     return notes
-
-
-def of_doubt(doubt: float) -> list[str]:
-    """That points may be so many metres from their places."""
-    if doubt < LEAST_DOUBT:
-        return []
-    shift, most = (f"{1000 * metres:.0f} mm" for metres in (doubt, MOST_DOUBT))
-    return [f"the camera was turned: points may still be {shift} off, and hands that far ({most}) away are preferred"]
 
 
 def of_target(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:

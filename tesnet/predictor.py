@@ -14,7 +14,6 @@ import numpy as np
 import torch
 
 from tesnet import calibration, candidates, cloud, collision, networks, notices, ranking, support, weights
-from tesnet.doubt import doubted
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import GraspSet, Pose
 from tesnet.networks import Network
@@ -190,12 +189,11 @@ class GraspPredictor:
         """A query's prepared cloud and the candidates that are free of collision; where there are none, its answer."""
         clock = _Clock(give_up)
         rejected = dict.fromkeys(REJECTIONS, 0)
-        query, corrected, doubt = calibration.calibrated(query)
+        query, corrected = calibration.calibrated(query)
         query, plane, said = support.settled(query)
         notes = [
             *notices.of_query(query, knows_hands=self._network.knows_hands),
             *corrected,
-            *notices.of_doubt(doubt),
             *said,
             *notices.of_support(query),
         ]
@@ -222,7 +220,7 @@ class GraspPredictor:
             sizes = (len(prepared), found.count, 0)
             notes += notices.of_answer(0.0, prepared, query)
             return _nothing(query, reason, sizes, rejected | found.rejected, notes, clock)
-        return _Proposal(query, prepared, edges, found, notes, clock, doubt)
+        return _Proposal(query, prepared, edges, found, notes, clock)
 
     def _search(
         self, prepared: cloud.PreparedCloud, query: GraspQuery, edges: Callable[[], Outline], clock: _Clock
@@ -250,7 +248,6 @@ class GraspPredictor:
         clock.start()
         clock.check()
         found, scores = self._best_search(proposal, features)
-        scores = doubted(scores, prepared, found.free, proposal.doubt)
         posted = torch.from_numpy(query.points.copy()).to(self.device)
         posted = cloud.in_canonical_frame(posted, prepared.T_cloud_canonical)
         found, scores, ranked = _ranked_clear(posted, found, scores, query, clock)
@@ -371,7 +368,6 @@ class _Proposal:
         found: at least one candidate without collision.
         notes: warnings for the answer.
         clock: the time of its stages.
-        doubt: how far from their places its points may be, metres.
     """
 
     query: GraspQuery
@@ -380,7 +376,6 @@ class _Proposal:
     found: _Free
     notes: list[str]
     clock: _Clock
-    doubt: float
 
 
 def _ranked(found: _Free, scores: torch.Tensor, query: GraspQuery) -> ranking.Ranking:
