@@ -225,6 +225,16 @@ def test_an_organised_pcd_has_rows_without_a_point() -> None:
     assert read_pcd(b"FIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nPOINTS 0\nDATA binary\n").points.shape == (0, 3)
 
 
+@pytest.mark.parametrize("comment", ["", " # a note", "\t// another"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("between", [" ", "   ", "\t", ",", ";", " , ", "; ", ";\t"])
+def test_text_is_the_same_whatever_separates_its_columns_and_lines(between: str, end: str, comment: str) -> None:
+    rows = [[0.5, -1.25, 2e-3, 255.0], [1.0, 2.0, 3.0, 0.0]]
+    lines = "".join(between.join(map(str, row)) + comment + end for row in rows).encode()
+    assert formats.format_of(lines) is TEXT
+    np.testing.assert_array_equal(read_text(lines).points, np.array(rows)[:, :3])
+
+
 @pytest.mark.parametrize("suffix", [".ply", ".pcd"])
 @pytest.mark.parametrize("as_text", [True, False])
 def test_normals_are_those_that_open3d_saves(tmp_path: Path, suffix: str, as_text: bool) -> None:

@@ -10,6 +10,8 @@ from typing import Any
 import numpy as np
 import pytest
 import torch
+from hypothesis import assume, given
+from hypothesis import strategies as st
 
 from tesnet import candidates, collision
 from tesnet.geometry import PANDA, WIDEST, GraspSet, Gripper, Pose
@@ -225,3 +227,16 @@ def test_a_known_hand_cannot_be_changed() -> None:
         HANDS["rg2"].gripper.max_width = 1.0  # type: ignore[misc]
     with pytest.raises(TypeError):
         HANDS["mine"] = HANDS["rg2"]  # type: ignore[index]
+
+
+@given(length=st.floats(0.06, 0.12), offset=st.floats(-0.03, 0.05), opening=st.floats(0.05, 0.15))
+def test_hands_whose_tips_swing_reach_farthest_where_nothing_reaches_farther(
+    length: float, offset: float, opening: float
+) -> None:
+    assume(max(abs(opening / 2 - offset), abs(offset)) < 0.9 * length)
+    hand = dataclasses.replace(HANDS["rg2"].gripper, max_width=opening, linkage_length=length, linkage_offset=offset)
+    widths = np.linspace(0, opening, 401)
+    reached = hand.tcp_at(widths)
+    assert 0 <= hand.farthest_width <= opening
+    assert hand.tcp_at(hand.farthest_width) >= reached.max() - 1e-12
+    assert hand.travel == pytest.approx(reached.max() - reached[-1], abs=1e-5)
