@@ -8,6 +8,7 @@ import pytest
 
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
+from training import hands as training_hands
 from training.hands import alike, drawn_hand, random_hand
 
 
@@ -40,6 +41,16 @@ def test_sizes_stay_among_those_of_real_hands() -> None:
 def test_hands_that_are_measured_are_not_met(name: str) -> None:
     assert alike(HANDS[name].gripper, HANDS[name].gripper)
     assert not any(alike(random_hand(np.random.default_rng(seed)).gripper, HANDS[name].gripper) for seed in range(300))
+
+
+@pytest.mark.parametrize("name", HANDS)
+def test_of_the_known_hands_only_franka_would_be_kept_if_it_were_drawn(
+    name: str, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    other = random_hand(np.random.default_rng(3)).gripper
+    coming = [HANDS[name].gripper, other]
+    monkeypatch.setattr(training_hands, "_draw", lambda rng: coming.pop(0))
+    assert random_hand(np.random.default_rng(0)).gripper == (HANDS["franka"].gripper if name == "franka" else other)
 
 
 def test_known_hands_come_by_their_names_and_draw_nothing() -> None:
