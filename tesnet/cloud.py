@@ -14,6 +14,7 @@ import torch
 from torch import Tensor
 
 from tesnet import smoothing
+from tesnet.depth_noise import NEAR, DepthNoise
 from tesnet.geometry import Box, Pose
 from tesnet.obstacles import Obstacles
 from tesnet.orientation import orient
@@ -45,6 +46,8 @@ _DEVIATIONS, _SURELY = 3.0, 4.0
 """Standard deviations that take most of a support's points away, and all but a few of ten thousand."""
 
 _FEWEST_BELOW = 200
+_MOST_ABOUT = 64_000
+"""Points about a support by which its noise is measured at each distance."""
 _NEAR_SUPPORT = 0.03
 
 MOST_ON_SUPPORT = 4_000
@@ -228,20 +231,38 @@ def prepare(
 
 def _support_noise(
     points: Tensor, query: GraspQuery, config: PreparationConfig, support: SupportPlane | None
-) -> tuple[float, float]:
-    """How high the noise of the support reaches among rows (N, 3 or more), and its standard deviation, 0 if unknown."""
-    reach = SUPPORT_NOISE if support is None else max(SUPPORT_NOISE, support.clearance)
-    if config.smooth_above is None:
-        return reach, 0.0
+) -> tuple[float | Tensor, float]:
+    """How high the noise of the support reaches, of all rows (N, 3 or more) or (N,) of each; and its deviation.
+
+    The standard deviation is 0 where it is unknown.
+    """
     if support is not None:
-        return max(reach, min(_DEVIATIONS * support.noise_sd, MOST_SUPPORT_NOISE)), support.noise_sd
+        clearance = torch.from_numpy(support.clearance(points[:, :3].cpu().numpy())).to(points)
+        return clearance.clamp(min=SUPPORT_NOISE), 0.0 if config.smooth_above is None else support.noise_sd
     known = _heights(points, query)
-    if known is None:
-        return reach, 0.0
+    if known is None or config.smooth_above is None:
+        return SUPPORT_NOISE, 0.0
     heights, support_height = known
     over = heights - support_height
     sd = _sd_under(over)
-    return _reach_of_seen(over, max(reach, min(_DEVIATIONS * sd, MOST_SUPPORT_NOISE))), sd
+    everywhere = _reach_of_seen(over, max(SUPPORT_NOISE, min(_DEVIATIONS * sd, MOST_SUPPORT_NOISE)))
+    return _reach_of_far(points, over, query, everywhere), sd
+
+
+def _reach_of_far(points: Tensor, over: Tensor, query: GraspQuery, everywhere: float) -> float | Tensor:
+    """How high the noise of a support reaches over each of the rows (N, 3 or more), whose heights over it are (N,).
+
+    More than `everywhere`, and (N,), where the camera is so far that it is over `SUPPORT_NOISE`.
+    """
+    about = torch.nonzero(over.abs() <= NEAR)[:, 0]
+    about = about[:: 1 + len(about) // _MOST_ABOUT]
+    viewpoints = np.zeros((1, 3)) if query.viewpoints is None else query.viewpoints
+    noise = DepthNoise.of(points[about, :3].cpu().numpy(), over[about].cpu().numpy(), viewpoints)
+    if noise is None:
+        return everywhere
+    reach = _SURELY * torch.from_numpy(noise.at(points[:, :3].cpu().numpy())).to(points)
+    noisy = reach > SUPPORT_NOISE
+    return torch.where(noisy, reach.clamp(min=everywhere), everywhere) if bool(noisy.any()) else everywhere
 
 
 def _heights(points: Tensor, query: GraspQuery) -> tuple[Tensor, float] | None:
@@ -306,8 +327,11 @@ def _outward(query: GraspQuery) -> Tensor | None:
     return torch.nn.functional.normalize(torch.from_numpy(to_viewer), dim=1).float()
 
 
-def above_support(points: Tensor, query: GraspQuery, noise: float = SUPPORT_NOISE) -> Tensor:
-    """Rows (N, 3 or more), beginning with x, y, z, that are not lower than a noise above the query's support plane."""
+def above_support(points: Tensor, query: GraspQuery, noise: float | Tensor = SUPPORT_NOISE) -> Tensor:
+    """Rows (N, 3 or more), beginning with x, y, z, that are not lower than a noise above the query's support plane.
+
+    The noise is that of all rows, or (N,) of each.
+    """
     known = _heights(points, query)
     if known is None:
         return points

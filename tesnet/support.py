@@ -5,22 +5,22 @@ Knows no candidate and no network. numpy only; lengths in metres.
 
 from __future__ import annotations
 
-from collections.abc import Iterable
+from collections.abc import Iterator
 from dataclasses import dataclass
 
 import numpy as np
 from numpy.typing import NDArray
 
-from tesnet.planes import SQUARE, Array, Mask, Plane, Surfaces, basis, cells, within
+from tesnet.depth_noise import NEAR, DepthNoise
+from tesnet.planes import SQUARE, TALLEST, Array, Mask, Plane, Surfaces, basis, cells, spread, within
 from tesnet.query import GraspQuery
 
 LOWEST = 0.003
-"""Above the plane, or `DEVIATIONS` of its noise where that is more: what is lower is the plane."""
-HIGHEST = 0.35
-"""Above the plane: what reaches higher does not stand on it for a hand to take."""
+"""Above the plane, or `DEVIATIONS` of its noise there where that is more: what is lower is the plane."""
 EDGE = 0.02
 """Of an outline."""
-DEVIATIONS = 3.0
+DEVIATIONS = 4.0
+"""Standard deviations over which noise lifts but a few of a hundred thousand points."""
 BELOW = 0.015
 MOST_SEEN_THROUGH = 0.15
 """Of a plane's own points: so many others may be seen through it; more, and it is a slice of the air."""
@@ -29,12 +29,12 @@ MOST_UNDER = 0.2
 """Under the top of a box are its sides. For a plane under `SMALL_AREA` square metres: points straight below it, as a
 share of its own."""
 LEAST_AREA = 0.008
-FEW_THINGS = 15
-"""Sampled points: fewer are as likely stray points as things."""
+MOST_LOOKED_AT, FEW_THINGS = 64_000, 30
+"""Points among which things are looked for, and how many of them: fewer are as likely stray points as things."""
 _FEWEST = 32
 _USUAL_UP = np.array([0.0, -0.8, -0.6])
 """In the frame of a camera that stands upright and looks down on a table."""
-_LEAST_LIKELIHOOD = 0.1
+_LEAST_LIKELIHOOD = 0.25
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -47,6 +47,7 @@ class SupportPlane:
         share: of what is seen, 0 to 1.
         noise_sd: robust standard deviation of its points about it.
         sides: (S, 4) unit outward normals across `up`, and distances along them, of its convex outline.
+        noise: where, by the distance from the camera.
     """
 
     up: Array
@@ -54,11 +55,11 @@ class SupportPlane:
     share: float
     noise_sd: float
     sides: Array
+    noise: DepthNoise
 
-    @property
-    def clearance(self) -> float:
-        """What is lower than this above it is the plane itself."""
-        return max(LOWEST, DEVIATIONS * self.noise_sd)
+    def clearance(self, points: NDArray[np.floating]) -> Array:
+        """(N,) over points (N, 3) or under them: what is lower than this above the plane is the plane itself."""
+        return np.maximum(LOWEST, DEVIATIONS * self.noise.at(points))
 
 
 def settled(query: GraspQuery) -> tuple[GraspQuery, SupportPlane | None, list[str]]:
@@ -96,7 +97,8 @@ def region(points: NDArray[np.float32], plane: SupportPlane) -> Mask:
     A margin of `EDGE` is left out, where walls and the sides of shelves and bins begin.
     """
     heights = points @ plane.up.astype(points.dtype) - plane.height
-    rows = np.flatnonzero((heights > plane.clearance) & (heights <= HIGHEST))
+    rows = np.flatnonzero((heights > LOWEST) & (heights <= TALLEST))
+    rows = rows[heights[rows] > plane.clearance(points[rows])]
     mask = np.zeros(len(points), dtype=bool)
     mask[rows[within(points[rows], plane.sides - np.array([0, 0, 0, EDGE]))]] = True
     return mask
@@ -105,63 +107,112 @@ def region(points: NDArray[np.float32], plane: SupportPlane) -> Mask:
 def find(query: GraspQuery) -> SupportPlane | None:
     """The plane that things stand on, if there is one: across the query's `up`, where it has one.
 
-    Of several it is the one with most of things and surface in view, which is mostly the nearest.
+    Of several that are parallel it is the nearest to the camera with things on it; of several directions, that with
+    most of things and surface in view.
     """
     points = query.points
     if query.workspace is not None:
         points = points[query.workspace.contains(points)]
     if len(points) < _FEWEST:
         return None
-    surfaces = Surfaces.of(points)
-    eye = None if query.viewpoints is None else query.viewpoints[0]
-    if query.known_up is not None:
-        planes: Iterable[Plane] = surfaces.planes_across(query.known_up)
-        likelihood = False
-    else:
-        eye = np.zeros(3) if eye is None else eye
-        planes = (plane for direction in surfaces.directions() for plane in surfaces.planes_near(direction))
-        planes = (plane if eye @ plane.up > plane.height else plane.turned for plane in planes)
-        likelihood = not (eye + query.offset).any()
+    surfaces, looked_at = Surfaces.of(points), spread(points, MOST_LOOKED_AT)
+    viewpoints = np.zeros((1, 3)) if query.viewpoints is None else query.viewpoints
+    eye = None if query.viewpoints is None and query.known_up is not None else viewpoints[0]
+    likely = query.known_up is None and not (viewpoints[0] + query.offset).any()
     best, most = None, 0.0
-    for plane in planes:
-        worth = _worth(plane, surfaces.points, eye)
-        if likelihood:
-            worth *= max(_LEAST_LIKELIHOOD, float(plane.up @ _USUAL_UP)) ** 2
+    for planes in _parallel(surfaces, query.known_up, eye):
+        judged = [_judged(plane, surfaces, looked_at, viewpoints, eye) for plane in planes]
+        worth = max(one.worth for one in judged)
+        if likely:
+            worth *= max(_LEAST_LIKELIHOOD, float(judged[0].support.up @ _USUAL_UP)) ** 4
         if worth > most:
-            best, most = plane, worth
-    if best is None:
-        return None
-    return SupportPlane(best.up, best.height, float(best.own.mean()), best.noise_sd, best.sides)
+            best, most = _nearest(judged), worth
+    return None if best is None else best.support
 
 
-def _worth(plane: Plane, points: Array, eye: Array | None) -> float:
-    """How much speaks for a plane; 0 where it is none that things can stand on."""
+def _parallel(surfaces: Surfaces, up: Array | None, eye: Array | None) -> Iterator[list[Plane]]:
+    """The planes whose upper side the eye sees, if it is known where that is, those together that are parallel.
+
+    Across `up` or, without it, in any direction.
+    """
+    if up is not None:
+        groups = [list(surfaces.planes_across(up))]
+    else:
+        found = [list(surfaces.planes_near(direction)) for direction in surfaces.directions()]
+        groups = [*found, *([plane.turned for plane in planes] for planes in found)]
+    for group in groups:
+        if seen := [plane for plane in group if eye is None or eye @ plane.up > plane.height]:
+            yield seen
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Judged:
+    """A plane that may be the support.
+
+    Args:
+        support: as it would be.
+        worth: how much speaks for it; 0 where it is none that things can stand on.
+        has_things: whether some do.
+    """
+
+    support: SupportPlane
+    worth: float
+    has_things: bool
+
+
+def _nearest(judged: list[_Judged]) -> _Judged:
+    """Of parallel planes the highest with things on it, which is nearest to the camera; or else the worthiest."""
+    return max(judged, key=lambda one: (one.has_things, one.support.height if one.has_things else one.worth))
+
+
+def _judged(
+    plane: Plane, surfaces: Surfaces, looked_at: NDArray[np.float32], viewpoints: Array, eye: Array | None
+) -> _Judged:
+    """What speaks for a plane, by the surfaces that it is one of and more of the points (N, 3)."""
+    over = looked_at @ plane.up.astype(looked_at.dtype) - plane.height
+    about = np.flatnonzero(np.abs(over) <= NEAR)
+    about = about[within(looked_at[about], plane.sides)]
+    noise = DepthNoise.of(looked_at[about], over[about], viewpoints)
+    noise = DepthNoise(viewpoints, plane.noise_sd, 0.0) if noise is None else noise
+    share = float(plane.own.mean())
+    support = SupportPlane(plane.up, plane.height, share, plane.noise_sd, plane.sides, noise)
+    if not _is_surface(plane, surfaces.points, eye):
+        return _Judged(support, 0.0, has_things=False)
+    things = _things(looked_at, support)
+    has_things = things >= FEW_THINGS
+    share_of_things = things / len(looked_at) if has_things else 1.0 / len(looked_at)
+    return _Judged(support, float(np.sqrt(share * share_of_things)), has_things)
+
+
+def _things(points: NDArray[np.float32], plane: SupportPlane) -> int:
+    """How many of the points (N, 3) are of things on a plane: of its region, but of nothing that reaches higher."""
+    over = points @ plane.up.astype(points.dtype) - plane.height
+    above = points[over > LOWEST]
+    if len(above) == 0:
+        return 0
+    u_v_height = above @ basis(plane.up).astype(points.dtype)
+    squares, square_of, _ = cells(u_v_height[:, :2], SQUARE)
+    top = np.full(len(squares), -np.inf)
+    np.maximum.at(top, square_of, u_v_height[:, 2] - plane.height)
+    return int((region(above, plane) & (top[square_of] <= TALLEST)).sum())
+
+
+def _is_surface(plane: Plane, points: Array, eye: Array | None) -> bool:
+    """Whether a plane among the points (P, 3) is one that things can stand on, where the eye is known seen from it."""
     u_v_height = points @ basis(plane.up)
     height = u_v_height[:, 2] - plane.height
-    squares, square_of, _ = cells(u_v_height[:, :2], SQUARE)
-    covered = np.zeros(len(squares), dtype=bool)
-    covered[square_of[plane.own]] = True
-    area = covered.sum() * SQUARE**2
-    own = int(plane.own.sum())
-    inside = within(points, plane.sides)
+    squares, _, _ = cells(u_v_height[plane.own, :2], SQUARE)
+    area, own = len(squares) * SQUARE**2, int(plane.own.sum())
     if area < LEAST_AREA:
-        return 0.0
-    if area < SMALL_AREA and (inside & (height < -BELOW)).sum() > MOST_UNDER * own:
-        return 0.0
-    if eye is not None and _seen_through(plane, points, height, eye) > MOST_SEEN_THROUGH * own:
-        return 0.0
-    above = inside & (height > max(LOWEST, DEVIATIONS * plane.noise_sd))
-    top = np.full(len(squares), -np.inf)
-    np.maximum.at(top, square_of[above], height[above])
-    things = int((above & (top[square_of] <= HIGHEST)).sum())
-    return float(np.sqrt(own) * (np.sqrt(things) if things >= FEW_THINGS else 1.0))
+        return False
+    if area < SMALL_AREA and (within(points, plane.sides) & (height < -BELOW)).sum() > MOST_UNDER * own:
+        return False
+    return eye is None or _seen_through(plane, points, height, eye) <= MOST_SEEN_THROUGH * own
 
 
 def _seen_through(plane: Plane, points: Array, height: Array, eye: Array) -> int:
     """How many points behind the plane are seen where it should hide them."""
     eye_height = float(eye @ plane.up - plane.height)
-    if eye_height <= 0:
-        return 0
     below = points[height < -BELOW]
     share = eye_height / (eye_height - height[height < -BELOW])
     crossings = eye + share[:, None] * (below - eye)
