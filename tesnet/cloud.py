@@ -11,6 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tesnet import smoothing
@@ -18,6 +19,7 @@ from tesnet.depth_noise import NEAR, DepthNoise
 from tesnet.geometry import Box, Pose
 from tesnet.obstacles import Obstacles
 from tesnet.orientation import orient
+from tesnet.planes import basis, cells
 from tesnet.points import (
     drop_points,
     estimate_normals,
@@ -48,6 +50,13 @@ _DEVIATIONS, _SURELY = 3.0, 4.0
 _FEWEST_BELOW = 200
 _MOST_ABOUT = 64_000
 """Points about a support by which its noise is measured at each distance."""
+_GROWN = 1.25
+"""Times the usual reach of a support's noise, from which on it has grown with the distance."""
+_MOST_NOISE = 0.0075
+"""Standard deviation over which what lies about a height that was given is no plane with noise, but things."""
+
+_COLUMN, _LEAST_HIGH = 0.0135, 0.1
+"""Edge of the squares of a support in which so large a share of the points is over its noise where things are."""
 _NEAR_SUPPORT = 0.03
 
 MOST_ON_SUPPORT = 4_000
@@ -238,7 +247,8 @@ def _support_noise(
     """
     if support is not None:
         clearance = torch.from_numpy(support.clearance(points[:, :3].cpu().numpy())).to(points)
-        return clearance.clamp(min=SUPPORT_NOISE), 0.0 if config.smooth_above is None else support.noise_sd
+        reach = clearance.clamp(min=SUPPORT_NOISE) if bool((clearance > SUPPORT_NOISE).any()) else SUPPORT_NOISE
+        return reach, 0.0 if config.smooth_above is None else support.noise_sd
     known = _heights(points, query)
     if known is None or config.smooth_above is None:
         return SUPPORT_NOISE, 0.0
@@ -252,17 +262,17 @@ def _support_noise(
 def _reach_of_far(points: Tensor, over: Tensor, query: GraspQuery, everywhere: float) -> float | Tensor:
     """How high the noise of a support reaches over each of the rows (N, 3 or more), whose heights over it are (N,).
 
-    More than `everywhere`, and (N,), where the camera is so far that it is over `SUPPORT_NOISE`.
+    (N,) where it grows with the distance from the camera to more than `everywhere`.
     """
     about = torch.nonzero(over.abs() <= NEAR)[:, 0]
     about = about[:: 1 + len(about) // _MOST_ABOUT]
     viewpoints = np.zeros((1, 3)) if query.viewpoints is None else query.viewpoints
-    noise = DepthNoise.of(points[about, :3].cpu().numpy(), over[about].cpu().numpy(), viewpoints)
-    if noise is None:
+    seen = points[about, :3].cpu().numpy()
+    noise = DepthNoise.of(seen, over[about].cpu().numpy(), viewpoints)
+    least = max(everywhere, min(_GROWN * everywhere, SUPPORT_NOISE)) / _SURELY
+    if noise is None or not least < noise.at(seen).max() <= _MOST_NOISE:
         return everywhere
-    reach = _SURELY * torch.from_numpy(noise.at(points[:, :3].cpu().numpy())).to(points)
-    noisy = reach > SUPPORT_NOISE
-    return torch.where(noisy, reach.clamp(min=everywhere), everywhere) if bool(noisy.any()) else everywhere
+    return (_SURELY * torch.from_numpy(noise.at(points[:, :3].cpu().numpy())).to(points)).clamp(min=everywhere)
 
 
 def _heights(points: Tensor, query: GraspQuery) -> tuple[Tensor, float] | None:
@@ -336,7 +346,32 @@ def above_support(points: Tensor, query: GraspQuery, noise: float | Tensor = SUP
     if known is None:
         return points
     heights, support_height = known
-    return points[heights >= support_height + noise]
+    over = heights - support_height
+    above = heights >= support_height + noise
+    if isinstance(noise, Tensor) and query.known_up is not None:
+        above &= ~_lifted(points, over, noise, query.known_up)
+    return points[above]
+
+
+def _lifted(points: Tensor, over: Tensor, noise: Tensor, up: NDArray[np.float64]) -> Tensor:
+    """Mask (N,) of rows that a support's noise may have lifted over its usual reach.
+
+    Those that are not over twice as high, and with few others beside them over that reach.
+
+    Args:
+        points: (N, 3 or more), beginning with x, y, z.
+        over: (N,) heights over the support.
+        noise: (N,) its usual reach.
+        up: (3,).
+    """
+    low = torch.nonzero(over.abs() < 2 * noise)[:, 0]
+    across = torch.from_numpy(basis(up)[:, :2]).to(points)
+    _, column_of, sizes = cells((points[low, :3] @ across).cpu().numpy(), _COLUMN)
+    high = (over[low] >= noise[low]).cpu().numpy()
+    few = np.bincount(column_of, high) < _LEAST_HIGH * sizes
+    mask = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    mask[low] = torch.from_numpy(high & few[column_of]).to(mask.device)
+    return mask
 
 
 def in_workspace(points: Tensor, query: GraspQuery) -> Tensor:

@@ -74,14 +74,14 @@ def _measured(
     deviation = 1.4826 * float(np.median(-over[below]))
     for _ in range(_ROUNDS):
         deviation = min(deviation, robust_sd(heights))
-        heights = heights[np.abs(heights) <= _CLIPPED_AT * deviation]
+        heights = heights[np.abs(heights - np.median(heights)) <= _CLIPPED_AT * deviation]
     return float(np.median(distances[below])), deviation
 
 
 def _distances(points: NDArray[np.floating], viewpoints: Array) -> Array:
     """(N,) from points (N, 3) to the nearest of the viewpoints (V, 3)."""
-    squares = np.full(len(points), np.inf)
+    squares: Array = np.full(len(points), np.inf)
     for viewpoint in viewpoints:
         offsets = points - viewpoint.astype(points.dtype)
-        squares = np.minimum(squares, np.einsum("ij,ij->i", offsets, offsets))
-    return np.sqrt(squares)
+        np.minimum(squares, np.einsum("ij,ij->i", offsets, offsets), out=squares)
+    return np.sqrt(squares, out=squares)

@@ -21,8 +21,7 @@ REACH = 10.0
 """Of the median; what is farther is none of the scene."""
 PATCHES = (0.03, 0.06, 0.12)
 """Edge of the cells whose points make one local normal: wide against the noise of a depth camera. Each point is in the
-first whose cell has twice the fewest points, so the nearer to the camera the narrower, but none is wider than most points
-need."""
+first whose cell has twice the fewest points, so the nearer to the camera the narrower; none is wider than most need."""
 FEWEST_OF_PATCH = 6
 FLAT = 0.25
 """A patch is flat where its least spread, as a standard deviation, is at most this share of the next."""
@@ -221,7 +220,7 @@ def spread(cloud: NDArray[np.floating], most: int) -> NDArray[np.floating]:
     return rows
 
 
-def cells(points: Array, edge: float) -> tuple[Indices, Indices, Indices]:
+def cells(points: NDArray[np.floating], edge: float) -> tuple[Indices, Indices, Indices]:
     """Occupied cells (C, D) of a grid, the number (N,) of each point's (N, D) cell, and the cells' sizes (C,)."""
     index = np.floor(points / edge).astype(np.intp)
     index -= index.min(axis=0)
@@ -279,7 +278,7 @@ def least_squares(points: Array, up: Array) -> tuple[Array, float]:
     return normal, float(mean @ normal)
 
 
-def robust_sd(residuals: Array) -> float:
+def robust_sd(residuals: NDArray[np.floating]) -> float:
     """The standard deviation of normal residuals (N,) that a few others do not change: 1.4826 median |r - median r|."""
     if len(residuals) == 0:
         return 0.0
