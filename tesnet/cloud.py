@@ -270,7 +270,7 @@ def _reach_of_far(points: Tensor, over: Tensor, query: GraspQuery, everywhere: f
     seen = points[about, :3].cpu().numpy()
     noise = DepthNoise.of(seen, over[about].cpu().numpy(), viewpoints)
     least = max(everywhere, min(_GROWN * everywhere, SUPPORT_NOISE)) / _SURELY
-    if noise is None or not least < noise.at(seen).max() <= _MOST_NOISE:
+    if noise is None or noise.at(seen).max() <= least or np.median(noise.at(seen)) > _MOST_NOISE:
         return everywhere
     return (_SURELY * torch.from_numpy(noise.at(points[:, :3].cpu().numpy())).to(points)).clamp(min=everywhere)
 

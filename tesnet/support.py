@@ -28,7 +28,8 @@ SMALL_AREA = 0.09
 MOST_UNDER = 0.2
 """Under the top of a box are its sides. For a plane under `SMALL_AREA` square metres: points straight below it, as a
 share of its own."""
-LEAST_AREA = 0.008
+LEAST_AREA, LEAST_WORTH = 0.008, 0.1
+"""What is smaller is no support, and under `SMALL_AREA` what less speaks for than such a part of the most."""
 MOST_LOOKED_AT, FEW_THINGS = 64_000, 30
 """Points among which things are looked for, and how many of them: fewer are as likely stray points as things."""
 _FEWEST = 32
@@ -151,18 +152,25 @@ class _Judged:
 
     Args:
         support: as it would be.
+        area: of it that is seen, square metres.
         worth: how much speaks for it; 0 where it is none that things can stand on.
         has_things: whether some do.
     """
 
     support: SupportPlane
+    area: float
     worth: float
     has_things: bool
 
 
 def _nearest(judged: list[_Judged]) -> _Judged:
-    """Of parallel planes the highest with things on it, which is nearest to the camera; or else the worthiest."""
-    return max(judged, key=lambda one: (one.has_things, one.support.height if one.has_things else one.worth))
+    """Of parallel planes the highest with things on it, which is nearest to the camera; or else the worthiest.
+
+    The tops of a few boxes are none where much more speaks for what these stand on.
+    """
+    least = LEAST_WORTH * max(one.worth for one in judged)
+    usual = [one for one in judged if one.has_things and (one.area >= SMALL_AREA or one.worth >= least)]
+    return max(usual, key=lambda one: one.support.height) if usual else max(judged, key=lambda one: one.worth)
 
 
 def _judged(
@@ -176,12 +184,13 @@ def _judged(
     noise = DepthNoise(viewpoints, plane.noise_sd, 0.0) if noise is None else noise
     share = float(plane.own.mean())
     support = SupportPlane(plane.up, plane.height, share, plane.noise_sd, plane.sides, noise)
-    if not _is_surface(plane, surfaces.points, eye):
-        return _Judged(support, 0.0, has_things=False)
+    area = _area(plane, surfaces.points)
+    if not _is_surface(plane, area, surfaces.points, eye):
+        return _Judged(support, area, 0.0, has_things=False)
     things = _things(looked_at, support)
     has_things = things >= FEW_THINGS
     share_of_things = things / len(looked_at) if has_things else 1.0 / len(looked_at)
-    return _Judged(support, float(np.sqrt(share * share_of_things)), has_things)
+    return _Judged(support, area, float(np.sqrt(share * share_of_things)), has_things)
 
 
 def _things(points: NDArray[np.float32], plane: SupportPlane) -> int:
@@ -197,12 +206,15 @@ def _things(points: NDArray[np.float32], plane: SupportPlane) -> int:
     return int((region(above, plane) & (top[square_of] <= TALLEST)).sum())
 
 
-def _is_surface(plane: Plane, points: Array, eye: Array | None) -> bool:
+def _area(plane: Plane, points: Array) -> float:
+    """Square metres of a plane that are covered by its own of the points (P, 3)."""
+    squares, _, _ = cells(points[plane.own] @ basis(plane.up)[:, :2], SQUARE)
+    return len(squares) * SQUARE**2
+
+
+def _is_surface(plane: Plane, area: float, points: Array, eye: Array | None) -> bool:
     """Whether a plane among the points (P, 3) is one that things can stand on, where the eye is known seen from it."""
-    u_v_height = points @ basis(plane.up)
-    height = u_v_height[:, 2] - plane.height
-    squares, _, _ = cells(u_v_height[plane.own, :2], SQUARE)
-    area, own = len(squares) * SQUARE**2, int(plane.own.sum())
+    height, own = points @ plane.up - plane.height, int(plane.own.sum())
     if area < LEAST_AREA:
         return False
     if area < SMALL_AREA and (within(points, plane.sides) & (height < -BELOW)).sum() > MOST_UNDER * own:

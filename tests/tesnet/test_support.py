@@ -225,7 +225,7 @@ def test_what_speaks_for_a_plane_is_what_a_loop_over_the_points_counts(seed: int
     plane = Plane(up, height, noise, sides, own)
     place = support.SupportPlane(up, height, 0.5, noise, sides, DepthNoise(np.zeros((1, 3)), noise, 0.0))
     is_surface, count = by_a_loop(plane, noise, points, eye)
-    assert support._is_surface(plane, points, eye) == is_surface
+    assert support._is_surface(plane, support._area(plane, points), points, eye) == is_surface
     assert support._things(points.astype(np.float32), place) == pytest.approx(count, abs=1)  # as float32 rounds
 
 
