@@ -19,8 +19,6 @@ _MOST_RANGES, _FEWEST = 8, 50
 """Ranges of distance that are measured, and points below the plane in each."""
 _ROUNDS, _CLIPPED_AT = 3, 3.0
 """Of clipping, at so many standard deviations."""
-_ROUNDING = 1e-6
-"""Of float32, metres, in what has no noise."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -76,7 +74,10 @@ def _measured(
     deviation = 1.4826 * float(np.median(-over[below]))
     for _ in range(_ROUNDS):
         deviation = min(deviation, robust_sd(heights))
-        heights = heights[np.abs(heights - np.median(heights)) <= _CLIPPED_AT * deviation + _ROUNDING]
+        near = np.abs(heights - np.median(heights)) <= _CLIPPED_AT * deviation
+        if not near.any():
+            break
+        heights = heights[near]
     return float(np.median(distances[below])), deviation
 
 

@@ -11,6 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
+from tesnet import plausibility
 from tesnet.depth_noise import NEAR, DepthNoise
 from tesnet.planes import SQUARE, TALLEST, Array, Mask, Plane, Surfaces, basis, cells, spread, within
 from tesnet.query import GraspQuery
@@ -30,6 +31,8 @@ MOST_UNDER = 0.2
 share of its own."""
 LEAST_AREA, LEAST_WORTH = 0.008, 0.1
 """What is smaller is no support, and under `SMALL_AREA` what less speaks for than such a part of the most."""
+LARGE_SHARE = 0.2
+"""Of what is seen."""
 MOST_LOOKED_AT, FEW_THINGS = 64_000, 30
 """Points among which things are looked for, and how many of them: fewer are as likely stray points as things."""
 _FEWEST = 32
@@ -46,6 +49,7 @@ class SupportPlane:
         up: (3,) unit, against gravity.
         height: along it.
         share: of what is seen, 0 to 1.
+        area: of it that is seen, square metres.
         noise_sd: robust standard deviation of its points about it.
         sides: (S, 4) unit outward normals across `up`, and distances along them, of its convex outline.
         noise: where, by the distance from the camera.
@@ -54,6 +58,7 @@ class SupportPlane:
     up: Array
     height: float
     share: float
+    area: float
     noise_sd: float
     sides: Array
     noise: DepthNoise
@@ -67,9 +72,12 @@ def settled(query: GraspQuery) -> tuple[GraspQuery, SupportPlane | None, list[st
     """The query with what is "auto" in it found, or left out where there is no plane; that plane; and notes."""
     finds_up = isinstance(query.up, str)
     if not finds_up and query.support_height != "auto":
-        return query, None, []
+        return query, None, _forgotten(query)
     plane = find(query)
     if plane is None:
+        wrong = None if finds_up else _reversed(query)
+        if wrong is not None:
+            return query.but(up=None, support_height=None), None, [f"{wrong}; here it was left out"]
         return query.but(up=query.known_up, support_height=None), None, [_NO_UP if finds_up else _NO_HEIGHT]
     note = _up_note(plane, query) if finds_up else f"support_height auto: {_figures(plane, query)}"
     return query.but(up=plane.up, support_height=plane.height), plane, [note]
@@ -77,6 +85,27 @@ def settled(query: GraspQuery) -> tuple[GraspQuery, SupportPlane | None, list[st
 
 _NO_UP = "up auto: no plane that things stand on was found, so none is kept clear and up is unknown: give up"
 _NO_HEIGHT = "support_height auto: no plane across up was found, so no support is kept clear: give the height, or up"
+
+
+def _forgotten(query: GraspQuery) -> list[str]:
+    """What is to be said where up is given alone: of a large plane, which is then grasped like things, or of up."""
+    if query.known_up is None or query.support_height is not None:
+        return []
+    plane = find(query)
+    if plane is None and (wrong := _reversed(query)) is not None:
+        return [wrong]
+    if plane is None or plane.share < LARGE_SHARE or plane.area < SMALL_AREA:
+        return []
+    note = f"support_height not given: grasps are looked for on {_figures(plane, query)}, too; give that height, or "
+    return [f'{note}support_height: "auto"']
+
+
+def _reversed(query: GraspQuery) -> str | None:
+    """What is to be said where `up`, turned round, has the plane that it lacks, seen by a camera that is known."""
+    if query.known_up is None or query.viewpoints is None:
+        return None
+    plane = find(query.but(up=-query.known_up))
+    return None if plane is None else plausibility.reversed_up(query.viewpoints @ -plane.up, -plane.height)
 
 
 def _up_note(plane: SupportPlane, query: GraspQuery) -> str:
@@ -152,13 +181,11 @@ class _Judged:
 
     Args:
         support: as it would be.
-        area: of it that is seen, square metres.
         worth: how much speaks for it; 0 where it is none that things can stand on.
         has_things: whether some do.
     """
 
     support: SupportPlane
-    area: float
     worth: float
     has_things: bool
 
@@ -169,7 +196,7 @@ def _nearest(judged: list[_Judged]) -> _Judged:
     The tops of a few boxes are none where much more speaks for what these stand on.
     """
     least = LEAST_WORTH * max(one.worth for one in judged)
-    usual = [one for one in judged if one.has_things and (one.area >= SMALL_AREA or one.worth >= least)]
+    usual = [one for one in judged if one.has_things and (one.support.area >= SMALL_AREA or one.worth >= least)]
     return max(usual, key=lambda one: one.support.height) if usual else max(judged, key=lambda one: one.worth)
 
 
@@ -182,15 +209,14 @@ def _judged(
     about = about[within(looked_at[about], plane.sides)]
     noise = DepthNoise.of(looked_at[about], over[about], viewpoints)
     noise = DepthNoise(viewpoints, plane.noise_sd, 0.0) if noise is None else noise
-    share = float(plane.own.mean())
-    support = SupportPlane(plane.up, plane.height, share, plane.noise_sd, plane.sides, noise)
-    area = _area(plane, surfaces.points)
+    share, area = float(plane.own.mean()), _area(plane, surfaces.points)
+    support = SupportPlane(plane.up, plane.height, share, area, plane.noise_sd, plane.sides, noise)
     if not _is_surface(plane, area, surfaces.points, eye):
-        return _Judged(support, area, 0.0, has_things=False)
+        return _Judged(support, 0.0, has_things=False)
     things = _things(looked_at, support)
     has_things = things >= FEW_THINGS
     share_of_things = things / len(looked_at) if has_things else 1.0 / len(looked_at)
-    return _Judged(support, area, float(np.sqrt(share * share_of_things)), has_things)
+    return _Judged(support, float(np.sqrt(share * share_of_things)), has_things)
 
 
 def _things(points: NDArray[np.float32], plane: SupportPlane) -> int:

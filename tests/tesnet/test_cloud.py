@@ -229,7 +229,7 @@ def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: f
     """Whether grasps are looked for there or not; a plane of little noise keeps the usual distance."""
     points = np.random.default_rng(0).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.06], (20_000, 3))
     sides = np.array([[1.0, 0, 0, 0.2], [-1.0, 0, 0, 0.2], [0, 1.0, 0, 0.2], [0, -1.0, 0, 0.2]])
-    plane = SupportPlane(UP, 0.0, 0.5, noise_sd, sides, DepthNoise(CAMERA[None], noise_sd, 0.0))
+    plane = SupportPlane(UP, 0.0, 0.5, 0.1, noise_sd, sides, DepthNoise(CAMERA[None], noise_sd, 0.0))
     query = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0)
     ready = cloud.prepare(query, cloud.PreparationConfig(), CPU, plane)
     assert ready is not None
@@ -301,7 +301,7 @@ def test_of_much_that_stands_on_a_found_support_the_nearest_to_the_camera_is_loo
     """The rest still blocks hands; where nothing was found, or a target given, the usual limit holds."""
     points = np.random.default_rng(0).uniform([-0.15, -0.15, 0.02], [0.15, 0.15, 0.06], (60_000, 3))
     sides = np.array([[1.0, 0, 0, 0.3], [-1.0, 0, 0, 0.3], [0, 1.0, 0, 0.3], [0, -1.0, 0, 0.3]])
-    plane = SupportPlane(UP, 0.0, 0.5, 0.001, sides, DepthNoise(CAMERA[None], 0.001, 0.0))
+    plane = SupportPlane(UP, 0.0, 0.5, 0.1, 0.001, sides, DepthNoise(CAMERA[None], 0.001, 0.0))
     query = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0)
     targeted = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0, target=Box(np.full(3, -1.0), np.full(3, 1.0)))
     config = cloud.PreparationConfig()

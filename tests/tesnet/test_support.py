@@ -171,7 +171,7 @@ def test_the_region_is_that_of_a_loop_over_its_points(seed: int, noise_sd: float
     normals = pose.rotate(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]))
     sides = np.column_stack([normals, normals @ pose.translation + [0.15, 0.15, 0.1, 0.1]])
     noise = DepthNoise(np.zeros((1, 3)), noise_sd, 0.0)
-    plane = support.SupportPlane(up, float(up @ pose.translation), 0.5, noise_sd, sides, noise)
+    plane = support.SupportPlane(up, float(up @ pose.translation), 0.5, 0.06, noise_sd, sides, noise)
     lowest = max(0.003, 4 * noise_sd)
     distances = [[abs(abs(x) - 0.13), abs(abs(y) - 0.08), abs(z - lowest), abs(z - 0.35)] for x, y, z in local.tolist()]
     clear = np.min(distances, axis=1) > 1e-5  # of every limit, whichever way float32 rounds
@@ -223,7 +223,7 @@ def test_what_speaks_for_a_plane_is_what_a_loop_over_the_points_counts(seed: int
     sides = np.column_stack([normals, normals @ pose.translation + np.repeat(half, 2)])
     noise, height = float(rng.choice([0.0005, 0.003])), float(up @ pose.translation)
     plane = Plane(up, height, noise, sides, own)
-    place = support.SupportPlane(up, height, 0.5, noise, sides, DepthNoise(np.zeros((1, 3)), noise, 0.0))
+    place = support.SupportPlane(up, height, 0.5, 0.1, noise, sides, DepthNoise(np.zeros((1, 3)), noise, 0.0))
     is_surface, count = by_a_loop(plane, noise, points, eye)
     assert support._is_surface(plane, support._area(plane, points), points, eye) == is_surface
     assert support._things(points.astype(np.float32), place) == pytest.approx(count, abs=1)  # as float32 rounds
@@ -283,3 +283,23 @@ def test_hardly_a_point_of_an_empty_plane_is_in_its_region_however_its_noise_gro
     plane = support.find(auto(points, viewpoints=np.zeros(3), up="auto"))
     assert plane is not None
     assert support.region(points.astype(np.float32), plane).sum() < 3e-4 * len(points)
+
+
+def test_up_alone_before_a_large_plane_has_the_remedy_named_and_before_things_alone_nothing() -> None:
+    table_with_things = ask(np.concatenate([tabletop(0), table()]), viewpoints=CAMERA, up=UP)
+    query, plane, (note,) = support.settled(table_with_things)
+    assert query is table_with_things
+    assert plane is None
+    assert "the plane at 0.0000 m along up" in note
+    assert 'give that height, or support_height: "auto"' in note
+    assert support.settled(ask(tabletop(0), viewpoints=CAMERA, up=UP))[2] == []
+
+
+@pytest.mark.parametrize("height", ["auto", None])
+def test_an_up_that_points_away_from_the_camera_is_named_and_with_auto_left_out(height: Any) -> None:
+    reversed_up = ask(np.concatenate([tabletop(0), table()]), viewpoints=CAMERA, up=-UP, support_height=height)
+    query, plane, (note,) = support.settled(reversed_up)
+    assert plane is None
+    assert "reverse it" in note
+    assert (query.up is None) == (height == "auto")
+    assert query.support_height is None
