@@ -58,7 +58,10 @@ def of_support(query: GraspQuery) -> list[str]:
 
 def of_answer(best: float, prepared: PreparedCloud, query: GraspQuery) -> list[str]:
     """Whether the scores are so low that the scale may be wrong."""
-    measured = plausibility.extents(prepared.points.cpu().numpy())
+    points, sight = prepared.points.cpu().numpy(), prepared.view_directions.double().mean(dim=0).cpu().numpy()
+    sight /= max(np.linalg.norm(sight), 1e-9)
+    # Where nothing was found, what lies along the sight has not been seen, as of a box from straight above.
+    measured = plausibility.extents(points) if best > 0 else plausibility.extents_across(points, sight)
     return plausibility.answer_notes(best, span(query.points), measured, query.gripper.max_width)
 
 

@@ -32,6 +32,8 @@ _FARTHEST, _NEAREST = 1.5, 0.05
 _ALL_NEAR = 0.2
 """Metres within which most depth cameras measure nothing: half of an image is hardly so near."""
 _LIKELY_DEPTHS = (0.3, 1.5)
+_LIKELY_PLACES = (0.03, 5.0)
+"""Metres from the origin of its frame at which a camera is put, by a hand or over a table."""
 _COUNTS: Mapping[float, str] = MappingProxyType({0.001: "1 mm", 0.0002: "1/5000 m", 0.0001: "0.1 mm"})
 """Metres per count of the usual depth cameras."""
 _SMALLEST_IMAGE = 32
@@ -73,6 +75,17 @@ def principal_point(camera: CameraIntrinsics) -> str | None:
     return (
         f"{where}: it is that of an image of about {2 * camera.cx + 1:.0f} x {2 * camera.cy + 1:.0f} pixels; scale the "
         "intrinsics to the resolution of the image, unless it is cropped"
+    )
+
+
+def camera_distance(distance: float) -> str | None:
+    """Whether a camera's distance from the origin of the cloud frame, metres, was likely given in millimetres."""
+    low, high = _LIKELY_PLACES
+    if not low <= distance / 1000 <= high:
+        return None
+    return (
+        f"T_cloud_camera puts the camera {distance:.4g} m from the origin; if that is {distance:.4g} mm, divide its "
+        "translation by 1000: it must be in metres"
     )
 
 
@@ -207,7 +220,7 @@ def answer_notes(best: float, extent: float, extents: NDArray[np.float64], max_w
     Args:
         best: of the scores.
         extent: of the posted cloud, from side to side, metres.
-        extents: (3,) of what grasps were looked for on, along its axes, metres.
+        extents: (E,) of what grasps were looked for on, metres.
         max_width: of the hand.
     """
     if best >= LOW_SCORE:
@@ -265,12 +278,12 @@ def low_scores(best: float, extent: float) -> str | None:
 
 
 def too_wide(best: float, extents: NDArray[np.float64], max_width: float) -> str | None:
-    """Whether all of a cloud's extents (3,) along its axes exceed the hand's opening, metres, and scores are low."""
+    """Whether all extents (E,) of what was looked at exceed the hand's opening, metres, and scores are low."""
     if best >= LOW_SCORE or extents.min() <= max_width:
         return None
     size = " x ".join(f"{extent:.2f}" for extent in sorted(extents, reverse=True))
     return (
-        f"what was sent measures {size} m along its axes, and the hand opens {max_width:g} m: if it is one thing, no "
+        f"what was looked at measures {size} m, and the hand opens {max_width:g} m: if it is one thing, no "
         "hand of this size fits it; check that it is in metres, or set a workspace"
     )
 
@@ -311,6 +324,11 @@ def extents(points: NDArray[Any]) -> NDArray[np.float64]:
     _, axes = np.linalg.eigh(centred.T @ centred)
     low, high = np.percentile(centred @ axes, [2, 98], axis=0)
     return np.asarray(high - low)
+
+
+def extents_across(points: NDArray[Any], sight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2,) metres from side to side of points (N, 3) as they are seen along a unit direction (3,), as `extents`."""
+    return np.sort(extents(points - (points @ sight)[:, None] * sight))[1:]
 
 
 def _likely_units(extent: float) -> str:

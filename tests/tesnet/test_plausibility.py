@@ -190,3 +190,20 @@ def test_a_viewpoint_with_points_on_all_sides_is_within_the_cloud() -> None:
     assert "within the cloud" in said
     assert plausibility.enclosed_viewpoint(ball, np.array([0.3, 0.1, 0.2])) is None
     assert plausibility.enclosed_viewpoint(40 * ball, np.zeros(3)) is None
+
+
+def test_a_camera_placed_in_millimetres_is_named_and_one_in_metres_or_far_away_is_not() -> None:
+    said = plausibility.camera_distance(500.0)
+    assert said is not None
+    assert "divide its translation by 1000" in said
+    for distance in (0.0, 0.5, 3.0, 20.0, 20_000.0):
+        assert plausibility.camera_distance(distance) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_extents_across_the_sight_are_those_of_what_is_seen(seed: int) -> None:
+    """Of a face that is seen straight on, whose thickness is not."""
+    rng = np.random.default_rng(seed)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    face = rng.uniform(-1, 1, (4000, 3)) * [0.15, 0.1, 0.0005] @ turn.T
+    np.testing.assert_allclose(plausibility.extents_across(face, turn[:, 2]), [0.192, 0.288], rtol=0.03)
