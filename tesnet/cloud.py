@@ -51,7 +51,7 @@ _FEWEST_BELOW = 200
 _MOST_ABOUT = 64_000
 """Points about a support by which its noise is measured at each distance."""
 _GROWN = 1.25
-"""Times the usual reach of a support's noise, from which on it has grown with the distance."""
+"""Times the usual noise of a support, from which on it has grown with the distance."""
 _MOST_NOISE = 0.0075
 """Standard deviation over which what lies about a height that was given is no plane with noise, but things."""
 
@@ -262,15 +262,17 @@ def _support_noise(
 def _reach_of_far(points: Tensor, over: Tensor, query: GraspQuery, everywhere: float) -> float | Tensor:
     """How high the noise of a support reaches over each of the rows (N, 3 or more), whose heights over it are (N,).
 
-    (N,) where it grows with the distance from the camera to more than `everywhere`.
+    (N,) where it grows with the distance from the camera, to more than `everywhere`.
     """
     about = torch.nonzero(over.abs() <= NEAR)[:, 0]
     about = about[:: 1 + len(about) // _MOST_ABOUT]
     viewpoints = np.zeros((1, 3)) if query.viewpoints is None else query.viewpoints
     seen = points[about, :3].cpu().numpy()
     noise = DepthNoise.of(seen, over[about].cpu().numpy(), viewpoints)
-    least = max(everywhere, min(_GROWN * everywhere, SUPPORT_NOISE)) / _SURELY
-    if noise is None or noise.at(seen).max() <= least or np.median(noise.at(seen)) > _MOST_NOISE:
+    if noise is None:
+        return everywhere
+    usual, most = np.quantile(noise.at(seen), [0.5, 1.0])
+    if most < _GROWN * usual or usual > _MOST_NOISE or _SURELY * most <= everywhere:
         return everywhere
     return (_SURELY * torch.from_numpy(noise.at(points[:, :3].cpu().numpy())).to(points)).clamp(min=everywhere)
 

@@ -242,19 +242,16 @@ def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: f
 
 @pytest.mark.parametrize("noise_sd", [0.0015, 0.0025, 0.008])
 @pytest.mark.parametrize("smooths", [True, False])
-def test_where_preparation_follows_the_noise_what_a_given_supports_noise_lifts_is_dropped(
+def test_where_preparation_follows_the_noise_what_a_given_supports_noise_lifts_is_dropped_up_to_a_centimetre(
     noise_sd: float, smooths: bool
 ) -> None:
-    """The noise is told by the points under the plane; here none of the surfaces is so noisy that it is smoothed.
-
-    Over 7.5 mm it is no noise, and a centimetre is dropped.
-    """
+    """The noise is told by the points under the plane; here none of the surfaces is so noisy that it is smoothed."""
     rng = np.random.default_rng(0)
     things = rng.uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.06], (30_000, 3))
     table = np.column_stack([rng.uniform(-0.1, 0.1, (3000, 2)), -np.abs(rng.normal(0, noise_sd, 3000))])
     query = ask(np.concatenate([things, table]), viewpoints=CAMERA, up=UP, support_height=0.0)
     ready = prepared(query, smooth_above=0.05 if smooths else None)
-    lowest = min(4 * noise_sd, cloud.MOST_SUPPORT_NOISE) if smooths else cloud.SUPPORT_NOISE
+    lowest = min(max(cloud.SUPPORT_NOISE, 3 * noise_sd), cloud.MOST_SUPPORT_NOISE) if smooths else cloud.SUPPORT_NOISE
     heights = ready.T_cloud_canonical.apply(ready.points.numpy())[:, 2]
     assert float(heights.min()) == pytest.approx(lowest + 0.001, abs=0.0015)
 
@@ -278,6 +275,23 @@ def test_of_a_support_that_is_seen_about_its_height_no_more_than_its_noise_is_dr
     ready = prepared(query, smooth_above=0.05)
     heights = ready.T_cloud_canonical.apply(ready.points.numpy())[:, 2]
     assert float(heights.min()) == pytest.approx(lowest + 0.001, abs=0.0015)
+
+
+def test_where_the_noise_of_a_given_support_grows_with_the_distance_as_much_more_is_dropped() -> None:
+    """Four standard deviations at each place, and what is lifted over that and stands alone."""
+    rng = np.random.default_rng(0)
+    table = np.column_stack([rng.uniform(-0.8, 0.8, (60_000, 2)), np.zeros(60_000)])
+    sd = 0.0012 * np.linalg.norm(table - CAMERA, axis=1)
+    table[:, 2] = sd * rng.standard_normal(len(table))
+    far, near = (rng.uniform([x, -0.05, 0.0], [x + 0.1, 0.05, 0.03], (4000, 3)) for x in (-0.75, 0.5))
+    query = ask(np.concatenate([table, far, near]), viewpoints=CAMERA, up=UP, support_height=0.0)
+    ready = prepared(query, smooth_above=0.05)
+    positions = ready.T_cloud_canonical.apply(ready.points.numpy())
+    among = [(np.abs(positions[:, 0] - x) < 0.06) & (np.abs(positions[:, 1]) < 0.06) for x in (-0.7, 0.55)]
+    assert (among[0] | among[1]).mean() > 0.97
+    for mask, x in zip(among, (-0.7, 0.55), strict=True):
+        reach = 4 * 0.0012 * np.linalg.norm(CAMERA - [x, 0, 0])
+        assert positions[mask, 2].min() == pytest.approx(max(reach, 0.0045), abs=0.0015)
 
 
 def test_a_cloud_is_as_noisy_as_its_own_surfaces_or_its_support_whichever_is_noisier() -> None:
