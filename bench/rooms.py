@@ -22,6 +22,8 @@ FARTHEST = 4.0
 VGA = (640, 480)
 SIZES = (VGA, (848, 480), (1280, 720), (1920, 1080))
 """Pixels of usual depth cameras, VGA to full HD."""
+NOISES = (0.0015, 0.003, 0.0)
+"""Standard deviations of a depth at one metre: of a usual camera, of a poor one, none."""
 FOCAL_SHARES = (0.95, 0.65)
 """Focal lengths over the image's width, of usual and of wide lenses."""
 
@@ -70,17 +72,14 @@ class RoomFrame:
 
 
 def frames(count: int, seed: int, sizes: tuple[tuple[int, int], ...] = SIZES) -> Iterator[tuple[str, RoomFrame]]:
-    """Named frames: kinds and, after all of them, sizes by turns; of a kind, every second one with a camera's noise.
-
-    Lenses are by turns usual and wide.
-    """
+    """Named frames: kinds by turns and, with each turn, another size, lens and noise."""
     kinds = list(KINDS.items())
     for number in range(count):
         name, kind = kinds[number % len(kinds)]
         rng = np.random.default_rng([seed, number])
-        noise = 0.0015 if number % 2 else 0.0
         turn = number // len(kinds)
         size, focal_share = sizes[turn % len(sizes)], FOCAL_SHARES[turn % len(FOCAL_SHARES)]
+        noise = NOISES[(number + turn) % len(NOISES)]
         yield f"{number:03d}_{name}", photograph(kind(rng), size, noise, rng, focal_share)
 
 
