@@ -48,8 +48,6 @@ _DEVIATIONS, _SURELY = 3.0, 4.0
 """Standard deviations that take most of a support's points away, and all but a few of ten thousand."""
 
 _FEWEST_BELOW = 200
-_MOST_ABOUT = 64_000
-"""Points about a support by which its noise is measured at each distance."""
 _GROWN = 1.25
 """Times the usual noise of a support, from which on it has grown with the distance."""
 _MOST_NOISE = 0.0075
@@ -265,7 +263,6 @@ def _reach_of_far(points: Tensor, over: Tensor, query: GraspQuery, everywhere: f
     (N,) where it grows with the distance from the camera, to more than `everywhere`.
     """
     about = torch.nonzero(over.abs() <= NEAR)[:, 0]
-    about = about[:: 1 + len(about) // _MOST_ABOUT]
     viewpoints = np.zeros((1, 3)) if query.viewpoints is None else query.viewpoints
     seen = points[about, :3].cpu().numpy()
     noise = DepthNoise.of(seen, over[about].cpu().numpy(), viewpoints)

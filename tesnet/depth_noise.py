@@ -11,10 +11,12 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tesnet.planes import Array, robust_sd
+from tesnet.planes import Array, robust_sd, spread
 
 NEAR = 0.05
 """From a plane: what is farther is not its noise."""
+_SAMPLE = 16_000
+"""Points that are looked at."""
 _MOST_RANGES, _FEWEST = 8, 50
 """Ranges of distance that are measured, and points below the plane in each."""
 _ROUNDS, _CLIPPED_AT = 3, 3.0
@@ -43,6 +45,8 @@ class DepthNoise:
 
         Nothing but noise is seen below a plane. None where too few points are: then it is not seen.
         """
+        rows = spread(np.arange(len(points)), _SAMPLE)
+        points, over = points[rows], over[rows]
         distances = _distances(points, viewpoints)
         below = np.sort(distances[over < 0])
         if len(below) < _FEWEST:

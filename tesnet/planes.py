@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -210,13 +211,13 @@ def _patches(points: Array) -> Indices:
     return patch_of
 
 
-def spread(cloud: NDArray[np.floating], most: int) -> NDArray[np.floating]:
+def spread(cloud: NDArray[Any], most: int) -> NDArray[Any]:
     """At most so many rows of a cloud, one in each stretch of its order; of an image, from all columns."""
     if len(cloud) <= most:
         return cloud
     step = len(cloud) / most
     number = np.arange(most)
-    rows: NDArray[np.floating] = cloud[((number + (number * _GOLDEN) % 1.0) * step).astype(np.intp)]
+    rows: NDArray[Any] = cloud[((number + (number * _GOLDEN) % 1.0) * step).astype(np.intp)]
     return rows
 
 
