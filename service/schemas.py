@@ -154,8 +154,8 @@ class GraspOptions(RequestPart):
         default=None,
         description="Direction [x, y, z] against gravity in the cloud frame, of any length. `auto` finds the plane "
         "that things stand on, of several the nearest to the camera that has some: its normal is up, its height "
-        "`support_height`; `warnings` gives the figures. Default: `auto` for a depth image; for a cloud none, so grasps from below are "
-        "not filtered, only those from behind what the camera sees, and `warnings` says so.",
+        "`support_height`; `warnings` gives the figures. Default: `auto` for a depth image; for a cloud none, so "
+        "grasps from below are not filtered, only those from behind what the camera sees, and `warnings` says so.",
     )
     workspace: Box | None = Field(
         default=None,
