@@ -29,8 +29,9 @@ APART = 2.0
 """Cells between neighbouring points from which on they describe no surface."""
 _FARTHEST, _NEAREST = 1.5, 0.05
 """Metres: hands work on what is nearer than the one, and hardly a camera sees what is nearer than the other."""
-_ALL_NEAR = 0.2
-"""Metres within which most depth cameras measure nothing: half of an image is hardly so near."""
+_NEAR, _ALL_NEAR = 0.17, 0.25
+"""Metres within which most depth cameras measure nothing, and within which half of an image hardly is: the nearest
+things alone may be a robot's own fingers."""
 _LIKELY_DEPTHS = (0.3, 1.5)
 _LIKELY_PLACES = (0.03, 5.0)
 """Metres from the origin of its frame at which a camera is put, by a hand or over a table."""
@@ -117,16 +118,19 @@ def depth_scale(depth: float, scale: float | None) -> str | None:
     return f"{what}: if that is not so, depth_scale {scale:g} is wrong: {_other_scales(depth, scale)}"
 
 
-def all_near(depth: float, scale: float | None) -> str | None:
-    """Whether an image whose median depth is this, metres, is nearer than cameras see and another scale is likely.
+def all_near(nearest: float, middle: float, scale: float | None) -> str | None:
+    """Whether an image shows what is nearer than cameras see, and another usual scale is more likely.
 
-    `scale` is in metres per count; None where metres were given.
+    Args:
+        nearest: depth of the nearest things, metres.
+        middle: the median depth, metres.
+        scale: metres per count; None where metres were given.
     """
-    if scale is None or depth > _ALL_NEAR or not (others := _likely_scales(depth, scale)):
+    if scale is None or nearest > _NEAR or middle > _ALL_NEAR or not (others := _likely_scales(nearest, scale)):
         return None
     return (
-        f"half of what is seen is within {depth:.2g} m of the camera, nearer than most depth cameras see; if that is "
-        f"not so, depth_scale {scale:g} is wrong: {', '.join(others)}"
+        f"half of what is seen is within {middle:.2g} m of the camera, the nearest things at {nearest:.2g} m, nearer "
+        f"than most depth cameras see; if that is not so, depth_scale {scale:g} is wrong: {', '.join(others)}"
     )
 
 
@@ -187,9 +191,9 @@ def depth_notes(camera: CameraIntrinsics, depths: NDArray[Any], scale: float | N
     """
     notes = [principal_point(camera)]
     if len(depths) and min(camera.width, camera.height) >= _SMALLEST_IMAGE:
-        nearest, middle = np.percentile(depths, [_NEAR_SHARE, 50]) * (1.0 if scale is None else scale)
-        wrong = depth_scale(float(nearest), scale) or all_near(float(middle), scale)
-        notes += [wrong, pixel_pitch(camera, float(nearest), stride, _CELL)]
+        nearest, middle = (np.percentile(depths, [_NEAR_SHARE, 50]) * (1.0 if scale is None else scale)).tolist()
+        wrong = depth_scale(nearest, scale) or all_near(nearest, middle, scale)
+        notes += [wrong, pixel_pitch(camera, nearest, stride, _CELL)]
     return [note for note in notes if note is not None]
 
 

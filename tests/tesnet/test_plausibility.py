@@ -99,10 +99,11 @@ def test_what_spans_too_much_is_blamed_on_the_field_of_an_image() -> None:
 def test_a_scale_that_brings_all_of_an_image_near_is_named_where_a_usual_one_would_fit(
     factor: float, scale: float
 ) -> None:
-    said = plausibility.all_near(0.7 * factor, scale * factor)
-    assert (said is not None) == any(0.3 <= 0.7 * other / scale <= 1.5 for other in (0.001, 0.0002, 0.0001))
-    assert plausibility.all_near(0.3, scale) is None
-    assert plausibility.all_near(0.7 * factor, None) is None
+    said = plausibility.all_near(0.6 * factor, 0.9 * factor, scale * factor)
+    assert said is not None
+    assert f"need {scale:g} (then it is 0.6 m)" in said
+    assert plausibility.all_near(0.1, 0.4, scale) is None  # such as fingers before a table
+    assert plausibility.all_near(0.6 * factor, 0.9 * factor, None) is None
 
 
 def test_an_image_in_a_tenth_of_its_scale_is_named_and_at_its_own_it_is_not() -> None:
