@@ -87,7 +87,7 @@ def _spacing(prepared: PreparedCloud, query: GraspQuery, config: PreparationConf
     if spacing <= plausibility.APART * config.voxel_size:
         return spacing
     posted = torch.from_numpy(query.points.copy())
-    sample = torch.from_numpy(spread(query.points, _SAMPLE))
+    sample = posted[torch.from_numpy(spread(np.arange(len(posted)), _SAMPLE))]
     return float((sample - posted[nearest_neighbours(posted, 2, sample)[:, 1]]).norm(dim=1).median())
 
 

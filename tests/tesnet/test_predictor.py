@@ -621,9 +621,9 @@ def test_the_noise_of_an_empty_plane_is_not_grasped(noise: float, given: str) ->
     rng = np.random.default_rng(0)
     frame = rooms.photograph(rooms.empty(rng), (320, 240), noise, rng)
     points, truth = frame.intrinsics.back_project(frame.counts * rooms.DEPTH_SCALE), frame.truth
-    options: dict[str, Any] = {"auto": {"up": "auto"}, "up": {"up": truth.up, "support_height": "auto"}}.get(
-        given, {"up": truth.up, "support_height": truth.height}
-    )
+    options: dict[str, Any] = {"up": "auto"} if given == "auto" else {"up": truth.up, "support_height": "auto"}
+    if given == "height":
+        options["support_height"] = truth.height
     result = fresh_predictor().predict(ask(points, viewpoints=np.zeros(3), **options))
     assert len(result.grasps) == 0
     assert not any("inches" in note for note in result.warnings)
