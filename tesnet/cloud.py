@@ -48,7 +48,7 @@ _DEVIATIONS, _SURELY = 3.0, 4.0
 """Standard deviations that take most of a support's points away, and all but a few of ten thousand."""
 
 _FEWEST_BELOW = 200
-_GROWN = 1.25
+_GROWN = 1.4
 """Times the usual noise of a support, from which on it has grown with the distance."""
 _MOST_NOISE = 0.0075
 """Standard deviation over which what lies about a height that was given is no plane with noise, but things."""
