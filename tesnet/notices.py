@@ -15,8 +15,8 @@ from tesnet.planes import spread
 from tesnet.points import nearest_neighbours
 from tesnet.query import NO_VIEWPOINT, GraspQuery, span
 
-_SAMPLE = 1000
-"""Posted points whose distance to the nearest other one is measured."""
+_SAMPLE = 10_000
+"""Posted points by which their extent, and the distance from one to the nearest other one, are measured."""
 
 COARSEST_RESOLUTION = 0.0005
 """Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
@@ -62,12 +62,12 @@ def of_answer(best: float, prepared: PreparedCloud, query: GraspQuery) -> list[s
     sight /= max(np.linalg.norm(sight), 1e-9)
     # Where nothing was found, what lies along the sight has not been seen, as of a box from straight above.
     measured = plausibility.extents(points) if best > 0 else plausibility.extents_across(points, sight)
-    return plausibility.answer_notes(best, span(query.points), measured, query.gripper.max_width)
+    return plausibility.answer_notes(best, span(spread(query.points, _SAMPLE)), measured, query.gripper.max_width)
 
 
 def _of_posted(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
     """What the posted points suggest, whatever of them was left to look for grasps on."""
-    extent = span(query.points)
+    extent = span(spread(query.points, _SAMPLE))
     if len(prepared) < MINIMUM_POINTS:
         note = plausibility.crowded(len(query.points), len(prepared), extent, config.voxel_size)
         return [] if note is None else [note]
