@@ -22,8 +22,10 @@ FARTHEST = 4.0
 VGA = (640, 480)
 SIZES = (VGA, (848, 480), (1280, 720), (1920, 1080))
 """Pixels of usual depth cameras, VGA to full HD."""
-_FOCAL_SHARE = 0.95
-"""Focal length over the image's width."""
+NOISES = (0.0015, 0.003, 0.0)
+"""Standard deviations of a depth at one metre: of a usual camera, of a poor one, none."""
+FOCAL_SHARES = (0.95, 0.65)
+"""Focal lengths over the image's width, of usual and of wide lenses."""
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -70,17 +72,24 @@ class RoomFrame:
 
 
 def frames(count: int, seed: int, sizes: tuple[tuple[int, int], ...] = SIZES) -> Iterator[tuple[str, RoomFrame]]:
-    """Named frames: kinds and sizes by turns; every second one has the noise of a usual camera."""
+    """Named frames: kinds by turns and, with each turn, another size, lens and noise."""
     kinds = list(KINDS.items())
     for number in range(count):
         name, kind = kinds[number % len(kinds)]
         rng = np.random.default_rng([seed, number])
-        noise = 0.0015 if number % 2 else 0.0
-        size = sizes[(number // len(kinds)) % len(sizes)]
-        yield f"{number:03d}_{name}", photograph(kind(rng), size, noise, rng)
+        turn = number // len(kinds)
+        size, focal_share = sizes[turn % len(sizes)], FOCAL_SHARES[turn % len(FOCAL_SHARES)]
+        noise = NOISES[(number + turn) % len(NOISES)]
+        yield f"{number:03d}_{name}", photograph(kind(rng), size, noise, rng, focal_share)
 
 
-def photograph(room: Room, size: tuple[int, int], noise: float, rng: np.random.Generator) -> RoomFrame:
+def photograph(
+    room: Room,
+    size: tuple[int, int],
+    noise: float,
+    rng: np.random.Generator,
+    focal_share: float = FOCAL_SHARES[0],
+) -> RoomFrame:
     """A frame of a room.
 
     Args:
@@ -88,9 +97,10 @@ def photograph(room: Room, size: tuple[int, int], noise: float, rng: np.random.G
         size: width and height of the image, pixels.
         noise: standard deviation of a depth at one metre; it grows with the square of the distance.
         rng: of the noise, of the camera's roll and of lost pixels, one in fifty where there is noise.
+        focal_share: focal length over the image's width.
     """
     width, height = size
-    focal = _FOCAL_SHARE * width
+    focal = focal_share * width
     intrinsics = CameraIntrinsics(width, height, fx=focal, fy=focal, cx=width / 2 - 0.5, cy=height / 2 - 0.5)
     T_world_camera = _rolled(_looking(room), np.deg2rad(rng.uniform(-5, 5)))
     rays_world = T_world_camera.rotate(intrinsics.back_project(np.ones((height, width))))
@@ -191,12 +201,53 @@ def overhead(rng: np.random.Generator) -> Room:
     return Room(tuple(solids), eye, np.array([0, 0, height]), height, _corners(length, depth))
 
 
+def small_table(rng: np.random.Generator) -> Room:
+    """A small table with one to three small things, much floor in view."""
+    length, depth, height = rng.uniform([0.45, 0.4, 0.4], [0.65, 0.5, 0.75])
+    count = int(rng.integers(1, 4))
+    solids = [_floor(), *_desk(length, depth, height), *_things(rng, np.zeros(2), 0.1, height, count, tallest=0.1)]
+    eye = np.array([0, 0, height]) + _sight(rng, 0.7, 1.0, 40, 55)
+    return Room(tuple(solids), eye, np.array([0, 0, height]), height, _corners(length, depth))
+
+
+def cabinet(rng: np.random.Generator) -> Room:
+    """A low cabinet with closed sides on the floor, things on it."""
+    length, depth, height = rng.uniform([0.45, 0.4, 0.3], [0.6, 0.5, 0.6])
+    body = (Block(np.array([length, depth, height]) / 2), standing(0, 0, height / 2))
+    solids = [_floor(), body, *_things(rng, np.zeros(2), 0.1, height, 4, tallest=0.14)]
+    eye = np.array([0, 0, height]) + _sight(rng, 0.7, 1.0, 40, 55)
+    return Room(tuple(solids), eye, np.array([0, 0, height]), height, _corners(length, depth))
+
+
+def stairs(rng: np.random.Generator) -> Room:
+    """Four steps, things on the second one."""
+    tread, rise, width = rng.uniform([0.28, 0.15, 1.0], [0.34, 0.19, 1.4])
+    step = Block(np.array([width, tread, rise]) / 2)
+    solids = [_floor()]
+    solids += [(step, standing(0, tread * row, rise * (up + 0.5))) for row in range(-1, 3) for up in range(row + 2)]
+    height = 2 * rise
+    solids += _things(rng, np.array([rng.uniform(-0.2, 0.2), -0.02]), 0.06, height, 3, tallest=0.14)
+    eye = np.array([rng.uniform(-0.1, 0.1), -0.75, height + rng.uniform(0.65, 0.8)])
+    return Room(tuple(solids), eye, np.array([0, 0, height]), height, _corners(width, tread))
+
+
+def empty(rng: np.random.Generator) -> Room:
+    """A large table, empty, from a metre away: nothing is to be grasped."""
+    solids = (_floor(), (Block(np.array([2.0, 2.0, 0.02])), standing(0, 0, 0.7)))
+    eye = np.array([0, 0, 0.72]) + _sight(rng, 0.8, 1.1, 40, 55)
+    return Room(solids, eye, np.array([0, 0, 0.72]), 0.72, _corners(4.0, 4.0))
+
+
 KINDS: Mapping[str, Callable[[np.random.Generator], Room]] = {
     "table": table,
     "desk": desk,
     "shelf": shelf,
     "bin": curved_bin,
     "overhead": overhead,
+    "small": small_table,
+    "cabinet": cabinet,
+    "stairs": stairs,
+    "empty": empty,
 }
 
 

@@ -218,7 +218,12 @@ def _parser() -> argparse.ArgumentParser:
     image = parser.add_argument_group("of a depth image")
     add = image.add_argument
     add("--intrinsics", type=_number, nargs=4, metavar=("FX", "FY", "CX", "CY"), help="its camera, in pixels")
-    add("--mask", type=Path, metavar="FILE", help="8- or 16-bit .png of the same size; only what it marks is grasped")
+    add(
+        "--mask",
+        type=Path,
+        metavar="FILE",
+        help="8- or 16-bit .png, or .npy, of the same size; only what it marks is grasped",
+    )
     add("--target-label", type=int, metavar="N", help="number of what is to be grasped in the mask")
     add("--camera-pose", type=_number, nargs=16, metavar="M", help="T_cloud_camera, row by row (default: identity)")
     add("--depth-scale", type=_number, metavar="M", help=f"metres per count (default: {DEFAULT_DEPTH_SCALE:g})")

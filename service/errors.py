@@ -177,7 +177,7 @@ def problem_response(error: Exception, scope: Scope) -> Response:
     else:
         row = next((PROBLEMS[kind] for kind in type(error).__mro__ if kind in PROBLEMS), INTERNAL)
         detail = str(error) if row is not INTERNAL else "The service's log has the reason under this request_id."
-        if isinstance(error, (Invalid, InvalidQuery)):
+        if isinstance(error, (Invalid, InvalidQuery, TooManyPoints)):
             field = error.field
         if isinstance(error, _TryLater):
             headers["Retry-After"] = str(error.retry_after)

@@ -153,9 +153,9 @@ class GraspOptions(RequestPart):
     up: Vector | Literal["auto"] | None = Field(
         default=None,
         description="Direction [x, y, z] against gravity in the cloud frame, of any length. `auto` finds the plane "
-        "that things stand on, of several that with most in view: its normal is up, its height `support_height`; "
-        "`warnings` gives the figures. Default: `auto` for a depth image; for a cloud none, so grasps from below are "
-        "not filtered, only those from behind what the camera sees, and `warnings` says so.",
+        "that things stand on, of several the nearest to the camera that has some: its normal is up, its height "
+        "`support_height`; `warnings` gives the figures. Default: `auto` for a depth image; for a cloud none, so "
+        "grasps from below are not filtered, only those from behind what the camera sees, and `warnings` says so.",
     )
     workspace: Box | None = Field(
         default=None,
@@ -169,7 +169,8 @@ class GraspOptions(RequestPart):
         "4 mm clear of it, or 1.5 mm where a thing is too thin for more: the height is "
         "taken to be exact. Tips that swing forward come lower if they close on nothing. `auto` finds the plane that "
         "things stand on, keeps clear of its noise as well, and `warnings` says where; without a `target`, grasps are "
-        "then looked for on those things alone, up to 0.35 m above it. Default: none.",
+        "then looked for on those things alone, up to 0.35 m above it. Default: none, and `warnings` says so where "
+        "`up` is given and a large plane is seen.",
     )
     target: Target | None = Field(
         default=None,

@@ -11,12 +11,15 @@ from dataclasses import dataclass
 
 import numpy as np
 import torch
+from numpy.typing import NDArray
 from torch import Tensor
 
 from tesnet import smoothing
+from tesnet.depth_noise import NEAR, DepthNoise
 from tesnet.geometry import Box, Pose
 from tesnet.obstacles import Obstacles
 from tesnet.orientation import orient
+from tesnet.planes import basis, cells
 from tesnet.points import (
     drop_points,
     estimate_normals,
@@ -45,6 +48,13 @@ _DEVIATIONS, _SURELY = 3.0, 4.0
 """Standard deviations that take most of a support's points away, and all but a few of ten thousand."""
 
 _FEWEST_BELOW = 200
+_GROWN = 1.4
+"""Times the usual noise of a support, from which on it has grown with the distance."""
+_MOST_NOISE = 0.0075
+"""Standard deviation over which what lies about a height that was given is no plane with noise, but things."""
+
+_COLUMN, _LEAST_HIGH = 0.0135, 0.1
+"""Edge of the squares of a support in which so large a share of the points is over its noise where things are."""
 _NEAR_SUPPORT = 0.03
 
 MOST_ON_SUPPORT = 4_000
@@ -228,20 +238,40 @@ def prepare(
 
 def _support_noise(
     points: Tensor, query: GraspQuery, config: PreparationConfig, support: SupportPlane | None
-) -> tuple[float, float]:
-    """How high the noise of the support reaches among rows (N, 3 or more), and its standard deviation, 0 if unknown."""
-    reach = SUPPORT_NOISE if support is None else max(SUPPORT_NOISE, support.clearance)
-    if config.smooth_above is None:
-        return reach, 0.0
+) -> tuple[float | Tensor, float]:
+    """How high the noise of the support reaches, of all rows (N, 3 or more) or (N,) of each; and its deviation.
+
+    The standard deviation is 0 where it is unknown.
+    """
     if support is not None:
-        return max(reach, min(_DEVIATIONS * support.noise_sd, MOST_SUPPORT_NOISE)), support.noise_sd
+        clearance = torch.from_numpy(support.clearance(points[:, :3].cpu().numpy())).to(points)
+        reach = clearance.clamp(min=SUPPORT_NOISE) if bool((clearance > SUPPORT_NOISE).any()) else SUPPORT_NOISE
+        return reach, 0.0 if config.smooth_above is None else support.noise_sd
     known = _heights(points, query)
-    if known is None:
-        return reach, 0.0
+    if known is None or config.smooth_above is None:
+        return SUPPORT_NOISE, 0.0
     heights, support_height = known
     over = heights - support_height
     sd = _sd_under(over)
-    return _reach_of_seen(over, max(reach, min(_DEVIATIONS * sd, MOST_SUPPORT_NOISE))), sd
+    everywhere = _reach_of_seen(over, max(SUPPORT_NOISE, min(_DEVIATIONS * sd, MOST_SUPPORT_NOISE)))
+    return _reach_of_far(points, over, query, everywhere), sd
+
+
+def _reach_of_far(points: Tensor, over: Tensor, query: GraspQuery, everywhere: float) -> float | Tensor:
+    """How high the noise of a support reaches over each of the rows (N, 3 or more), whose heights over it are (N,).
+
+    (N,) where it grows with the distance from the camera, to more than `everywhere`.
+    """
+    about = torch.nonzero(over.abs() <= NEAR)[:, 0]
+    viewpoints = np.zeros((1, 3)) if query.viewpoints is None else query.viewpoints
+    seen = points[about, :3].cpu().numpy()
+    noise = DepthNoise.of(seen, over[about].cpu().numpy(), viewpoints)
+    if noise is None:
+        return everywhere
+    usual, most = np.quantile(noise.at(seen), [0.5, 1.0])
+    if most < _GROWN * usual or usual > _MOST_NOISE or _SURELY * most <= everywhere:
+        return everywhere
+    return (_SURELY * torch.from_numpy(noise.at(points[:, :3].cpu().numpy())).to(points)).clamp(min=everywhere)
 
 
 def _heights(points: Tensor, query: GraspQuery) -> tuple[Tensor, float] | None:
@@ -306,13 +336,41 @@ def _outward(query: GraspQuery) -> Tensor | None:
     return torch.nn.functional.normalize(torch.from_numpy(to_viewer), dim=1).float()
 
 
-def above_support(points: Tensor, query: GraspQuery, noise: float = SUPPORT_NOISE) -> Tensor:
-    """Rows (N, 3 or more), beginning with x, y, z, that are not lower than a noise above the query's support plane."""
+def above_support(points: Tensor, query: GraspQuery, noise: float | Tensor = SUPPORT_NOISE) -> Tensor:
+    """Rows (N, 3 or more), beginning with x, y, z, that are not lower than a noise above the query's support plane.
+
+    The noise is that of all rows, or (N,) of each.
+    """
     known = _heights(points, query)
     if known is None:
         return points
     heights, support_height = known
-    return points[heights >= support_height + noise]
+    over = heights - support_height
+    above = heights >= support_height + noise
+    if isinstance(noise, Tensor) and query.known_up is not None:
+        above &= ~_lifted(points, over, noise, query.known_up)
+    return points[above]
+
+
+def _lifted(points: Tensor, over: Tensor, noise: Tensor, up: NDArray[np.float64]) -> Tensor:
+    """Mask (N,) of rows that a support's noise may have lifted over its usual reach.
+
+    Those that are not over twice as high, and with few others beside them over that reach.
+
+    Args:
+        points: (N, 3 or more), beginning with x, y, z.
+        over: (N,) heights over the support.
+        noise: (N,) its usual reach.
+        up: (3,).
+    """
+    low = torch.nonzero(over.abs() < 2 * noise)[:, 0]
+    across = torch.from_numpy(basis(up)[:, :2]).to(points)
+    _, column_of, sizes = cells((points[low, :3] @ across).cpu().numpy(), _COLUMN)
+    high = (over[low] >= noise[low]).cpu().numpy()
+    few = np.bincount(column_of, high) < _LEAST_HIGH * sizes
+    mask = torch.zeros(len(points), dtype=torch.bool, device=points.device)
+    mask[low] = torch.from_numpy(high & few[column_of]).to(mask.device)
+    return mask
 
 
 def in_workspace(points: Tensor, query: GraspQuery) -> Tensor:

@@ -49,13 +49,18 @@ class TooManyPoints(TesnetError):
     Args:
         count: how many it has or claims to have; words where they were not counted to the end.
         limit: how many may be.
+        remedy: what to do.
+        field: what holds them, as on the wire; None for a body of points.
     """
 
-    def __init__(self, count: int | str, limit: int) -> None:
+    def __init__(
+        self, count: int | str, limit: int, remedy: str = "crop or downsample it", field: str | None = None
+    ) -> None:
         shown = f"over {_MOST_SHOWN}" if isinstance(count, int) and count > _MOST_SHOWN else count
-        super().__init__(f"The cloud has {shown} points (limit {limit}); crop or downsample it.")
+        super().__init__(f"The cloud has {shown} points (limit {limit}); {remedy}.")
         self.count = count
         self.limit = limit
+        self.field = field
 
 
 class WeightsError(TesnetError):

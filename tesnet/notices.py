@@ -6,12 +6,17 @@ What the numbers themselves suggest of a mistake is judged in `tesnet.plausibili
 from __future__ import annotations
 
 import numpy as np
+import torch
 
 from tesnet import plausibility
 from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, PreparedCloud
 from tesnet.geometry import PANDA, Box
+from tesnet.planes import spread
 from tesnet.points import nearest_neighbours
-from tesnet.query import NO_VIEWPOINT, GraspQuery
+from tesnet.query import NO_VIEWPOINT, GraspQuery, span
+
+_SAMPLE = 10_000
+"""Posted points by which their extent, and the distance from one to the nearest other one, are measured."""
 
 COARSEST_RESOLUTION = 0.0005
 """Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
@@ -53,24 +58,42 @@ def of_support(query: GraspQuery) -> list[str]:
 
 def of_answer(best: float, prepared: PreparedCloud, query: GraspQuery) -> list[str]:
     """Whether the scores are so low that the scale may be wrong."""
-    return plausibility.answer_notes(best, prepared.points.cpu().numpy(), query.gripper.max_width)
+    points, sight = prepared.points.cpu().numpy(), prepared.view_directions.double().mean(dim=0).cpu().numpy()
+    sight /= max(np.linalg.norm(sight), 1e-9)
+    # Where nothing was found, what lies along the sight has not been seen, as of a box from straight above.
+    measured = plausibility.extents(points) if best > 0 else plausibility.extents_across(points, sight)
+    return plausibility.answer_notes(best, span(spread(query.points, _SAMPLE)), measured, query.gripper.max_width)
 
 
-def _of_points(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
-    points = prepared.points
-    # A network that uses no graph asks for no neighbours but the point itself.
-    neighbours = prepared.neighbours if config.graph_neighbours > 1 else nearest_neighbours(points, 2)
-    spacing = float((points - points[neighbours[:, 1]]).norm(dim=1).median())
-    notes = plausibility.cloud_notes(points.cpu().numpy(), spacing, config.voxel_size)
+def _of_posted(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
+    """What the posted points suggest, whatever of them was left to look for grasps on."""
+    extent = span(spread(query.points, _SAMPLE))
+    if len(prepared) < MINIMUM_POINTS:
+        note = plausibility.crowded(len(query.points), len(prepared), extent, config.voxel_size)
+        return [] if note is None else [note]
+    notes = plausibility.cloud_notes(_spacing(prepared, query, config), extent, config.voxel_size)
     if query.viewpoints is not None:
         enclosed = (plausibility.enclosed_viewpoint(query.points, viewpoint) for viewpoint in query.viewpoints)
         notes += [note for note in enclosed if note is not None]
     return notes
 
 
+def _spacing(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> float:
+    """The median distance from a prepared point to the nearest other one or, where that is large, of posted ones."""
+    points = prepared.points
+    # A network that uses no graph asks for no neighbours but the point itself.
+    neighbours = prepared.neighbours if config.graph_neighbours > 1 else nearest_neighbours(points, 2)
+    spacing = float((points - points[neighbours[:, 1]]).norm(dim=1).median())
+    if spacing <= plausibility.APART * config.voxel_size:
+        return spacing
+    posted = torch.from_numpy(query.points.copy())
+    sample = posted[torch.from_numpy(spread(np.arange(len(posted)), _SAMPLE))]
+    return float((sample - posted[nearest_neighbours(posted, 2, sample)[:, 1]]).norm(dim=1).median())
+
+
 def of_cloud(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
-    """What the prepared cloud suggests of a mistake, and what was left out of it."""
-    notes = _of_points(prepared, query, config) if len(prepared) >= MINIMUM_POINTS else []
+    """What the cloud suggests of a mistake, and what was left out of it."""
+    notes = _of_posted(prepared, query, config)
     distance = float(np.abs(prepared.T_cloud_canonical.translation).max())
     resolution = float(np.spacing(np.float32(distance)))
     if resolution > COARSEST_RESOLUTION:

@@ -7,6 +7,7 @@ from __future__ import annotations
 
 from collections.abc import Iterator
 from dataclasses import dataclass
+from typing import Any
 
 import numpy as np
 from numpy.typing import NDArray
@@ -20,15 +21,15 @@ SAMPLE = 8_000
 REACH = 10.0
 """Of the median; what is farther is none of the scene."""
 PATCHES = (0.03, 0.06, 0.12)
-"""Edge of the cells whose points make one local normal: wide against the noise of a depth camera. The first is taken in
-which most points are in patches of twice the fewest points, or else the last."""
+"""Edge of the cells whose points make one local normal: wide against the noise of a depth camera. Each point is in the
+first whose cell has twice the fewest points, so the nearer to the camera the narrower; none is wider than most need."""
 FEWEST_OF_PATCH = 6
 FLAT = 0.25
 """A patch is flat where its least spread, as a standard deviation, is at most this share of the next."""
 DIRECTIONS = 500
 """Directions that are voted for; some 6 degrees lie between neighbours."""
 MOST_DIRECTIONS, MOST_HEIGHTS = 5, 5
-LEAST_SHARE = 0.03
+LEAST_SHARE = 0.01
 """Of the sample: fewer votes make no direction, and fewer points no plane."""
 FEWEST_POINTS = 60
 AGREEING, ALIGNED = np.cos(np.deg2rad([10.0, 20.0]))
@@ -44,6 +45,8 @@ LEAST_RADIUS = 1.5
 """A surface that bends more than this is no plane, but the floor of a bin, say."""
 SQUARE = 0.04
 """Edge of the squares of a footprint. A gap of one square, as behind things, does not part it."""
+TALLEST = 0.35
+"""Above a plane: what reaches higher does not stand on it for a hand to take."""
 SIDES = 24
 """Of an outline."""
 _TURNS = 90
@@ -96,11 +99,8 @@ class Surfaces:
         """Those of a cloud (N, 3) with at least one point, within `REACH` of its median."""
         points = spread(cloud, SAMPLE).astype(np.float64)
         points = points[((points - np.median(points, axis=0)) ** 2).sum(axis=1) <= REACH**2]
-        for edge in PATCHES:
-            _, patch_of, sizes = cells(points, edge)
-            if np.median(sizes[patch_of]) >= 2 * FEWEST_OF_PATCH:
-                break
-        counts = sizes.astype(np.float64)
+        patch_of = _patches(points)
+        counts = np.bincount(patch_of).astype(np.float64)
         means = np.stack([np.bincount(patch_of, points[:, axis]) for axis in range(3)], axis=1) / counts[:, None]
         deviations = points - means[patch_of]
         covariances = np.empty((len(counts), 3, 3))
@@ -137,7 +137,7 @@ class Surfaces:
                 residuals = self.points @ up - middle
                 own = able & (np.abs(residuals) <= band)
                 own &= np.abs(residuals) <= max(DEVIATIONS * robust_sd(residuals[own]), LEAST_BAND)
-                own = self._piece(up, own)
+                own = self._piece(up, middle, own)
                 if own.sum() < FEWEST_POINTS:
                     break
                 up, middle = least_squares(self.points[own & sure if (own & sure).sum() >= FEWEST_POINTS else own], up)
@@ -148,8 +148,11 @@ class Surfaces:
         """The planes whose normal is a unit direction (3,)."""
         for height, able, sure in self._heights(up, BANDS[-1]):
             residuals = np.abs(self.points @ up - height)
-            own, wide = (self._piece(up, able & (residuals <= band)) for band in (BANDS[-1], BANDS[0]))
-            if own.sum() >= FEWEST_POINTS and least_squares(self.points[wide & sure], up)[0] @ up >= MOST_TILT:
+            own, wide = (self._piece(up, height, able & (residuals <= band)) for band in (BANDS[-1], BANDS[0]))
+            wide &= sure
+            if min(own.sum(), wide.sum()) < FEWEST_POINTS:
+                continue
+            if least_squares(self.points[wide], up)[0] @ up >= MOST_TILT:
                 yield from self._plane(up, float(np.median(self.points[own] @ up)), able, sure)
 
     def _heights(self, direction: Array, half: float) -> Iterator[tuple[float, Mask, Mask]]:
@@ -172,34 +175,53 @@ class Surfaces:
         residuals = self.points @ up - height
         near = np.abs(residuals) <= BANDS[-1]
         noise = robust_sd(residuals[near & sure])
-        own = self._piece(up, able & (np.abs(residuals) <= max(DEVIATIONS * noise, LEAST_BAND)))
+        own = self._piece(up, height, able & (np.abs(residuals) <= max(DEVIATIONS * noise, LEAST_BAND)))
         enough = own.sum() >= max(FEWEST_POINTS, LEAST_SHARE * len(self.points))
         if enough and (own & sure).any() and radius(self.points[own & sure], up) >= LEAST_RADIUS:
             yield Plane(up, height, noise, outline(self.points[own & sure], up), own)
 
-    def _piece(self, up: Array, near: Mask) -> Mask:
-        """Of points (mask (P,)) about a plane, those of the largest piece that hangs together."""
-        rows = np.flatnonzero(near)
-        if len(rows) == 0:
+    def _piece(self, up: Array, height: float, near: Mask) -> Mask:
+        """Of points (mask (P,)) about a plane, those of the largest piece that hangs together.
+
+        What stands on it, on either side and up to `TALLEST`, does not part it.
+        """
+        if not near.any():
             return near
+        rows = np.flatnonzero(np.abs(self.points @ up - height) <= TALLEST)
         squares, square_of, _ = cells(self.points[rows] @ basis(up)[:, :2], SQUARE)
         label = pieces(squares)[square_of]
         kept = np.zeros_like(near)
-        kept[rows[label == np.bincount(label).argmax()]] = True
-        return kept
+        kept[rows[label == np.bincount(label[near[rows]]).argmax()]] = True
+        return kept & near
 
 
-def spread(cloud: NDArray[np.floating], most: int) -> NDArray[np.floating]:
+def _patches(points: Array) -> Indices:
+    """(P,) number of the patch of each of the points (P, 3)."""
+    patch_of, left, count = np.zeros(len(points), dtype=np.intp), np.arange(len(points)), 0
+    for edge in PATCHES:
+        _, cell_of, sizes = cells(points, edge)
+        full = sizes[cell_of] >= 2 * FEWEST_OF_PATCH
+        last = edge == PATCHES[-1] or full.mean() >= 0.5
+        taken = left if last else left[full[left]]
+        numbers, number_of = np.unique(cell_of[taken], return_inverse=True)
+        patch_of[taken] = count + number_of
+        if last:
+            break
+        left, count = left[~full[left]], count + len(numbers)
+    return patch_of
+
+
+def spread(cloud: NDArray[Any], most: int) -> NDArray[Any]:
     """At most so many rows of a cloud, one in each stretch of its order; of an image, from all columns."""
     if len(cloud) <= most:
         return cloud
     step = len(cloud) / most
     number = np.arange(most)
-    rows: NDArray[np.floating] = cloud[((number + (number * _GOLDEN) % 1.0) * step).astype(np.intp)]
+    rows: NDArray[Any] = cloud[((number + (number * _GOLDEN) % 1.0) * step).astype(np.intp)]
     return rows
 
 
-def cells(points: Array, edge: float) -> tuple[Indices, Indices, Indices]:
+def cells(points: NDArray[np.floating], edge: float) -> tuple[Indices, Indices, Indices]:
     """Occupied cells (C, D) of a grid, the number (N,) of each point's (N, D) cell, and the cells' sizes (C,)."""
     index = np.floor(points / edge).astype(np.intp)
     index -= index.min(axis=0)
@@ -257,7 +279,7 @@ def least_squares(points: Array, up: Array) -> tuple[Array, float]:
     return normal, float(mean @ normal)
 
 
-def robust_sd(residuals: Array) -> float:
+def robust_sd(residuals: NDArray[np.floating]) -> float:
     """The standard deviation of normal residuals (N,) that a few others do not change: 1.4826 median |r - median r|."""
     if len(residuals) == 0:
         return 0.0

@@ -14,7 +14,6 @@ import numpy as np
 from numpy.typing import NDArray
 
 from tesnet.geometry import CameraIntrinsics
-from tesnet.query import span
 
 LOW_SCORE = 0.5
 """Scores below this promise nothing; where all are, the scale may be wrong."""
@@ -26,11 +25,16 @@ _LIKELY_SPANS = (0.02, 1.5)
 """Metres from side to side of what stands before a hand: one thing, or a table."""
 _WIDE = 1.0
 """Metres from which on a cloud of points that lie apart may be in another unit."""
-_APART = 2.0
+APART = 2.0
 """Cells between neighbouring points from which on they describe no surface."""
 _FARTHEST, _NEAREST = 1.5, 0.05
 """Metres: hands work on what is nearer than the one, and hardly a camera sees what is nearer than the other."""
-_LIKELY_DEPTHS = (0.1, 1.5)
+_NEAR, _ALL_NEAR = 0.17, 0.25
+"""Metres within which most depth cameras measure nothing, and within which half of an image hardly is: the nearest
+things alone may be a robot's own fingers."""
+_LIKELY_DEPTHS = (0.3, 1.5)
+_LIKELY_PLACES = (0.03, 5.0)
+"""Metres from the origin of its frame at which a camera is put, by a hand or over a table."""
 _COUNTS: Mapping[float, str] = MappingProxyType({0.001: "1 mm", 0.0002: "1/5000 m", 0.0001: "0.1 mm"})
 """Metres per count of the usual depth cameras."""
 _SMALLEST_IMAGE = 32
@@ -38,6 +42,8 @@ _SMALLEST_IMAGE = 32
 _OFF_MIDDLE = 0.1
 _NEAR_MIDDLE = 0.05
 """Shares of an image's size by which a principal point is suspiciously, and usually, off its middle."""
+_SMALL, _MANY = 0.15, 500
+"""Metres from side to side within which a cloud of so many points should leave more of them on the grid."""
 
 
 # ----------------------------------------------------------------------------------------------------------- the camera
@@ -73,6 +79,17 @@ def principal_point(camera: CameraIntrinsics) -> str | None:
     )
 
 
+def camera_distance(distance: float) -> str | None:
+    """Whether a camera's distance from the origin of the cloud frame, metres, was likely given in millimetres."""
+    low, high = _LIKELY_PLACES
+    if not low <= distance / 1000 <= high:
+        return None
+    return (
+        f"T_cloud_camera puts the camera {distance:.4g} m from the origin; if that is {distance:.4g} mm, divide its "
+        "translation by 1000: it must be in metres"
+    )
+
+
 def pixel_pitch(camera: CameraIntrinsics, depth: float, stride: int, cell: float) -> str | None:
     """Whether pixels at a depth (metres) lie farther apart than the cells (metres) of the grid that a network sees."""
     pitch = depth * stride / min(camera.fx, camera.fy)
@@ -97,8 +114,24 @@ def depth_scale(depth: float, scale: float | None) -> str | None:
     what = f"the nearest things are {depth:.3g} m from the camera, "
     what += "where no hand reaches" if depth > _FARTHEST else "nearer than cameras see"
     if scale is None:
-        return f"{what}: depths of floating point must be metres; save whole numbers and give depth_scale for counts"
+        return f"{what}: depths of floating point must be metres: {_metres(depth)}"
     return f"{what}: if that is not so, depth_scale {scale:g} is wrong: {_other_scales(depth, scale)}"
+
+
+def all_near(nearest: float, middle: float, scale: float | None) -> str | None:
+    """Whether an image shows what is nearer than cameras see, and another usual scale is more likely.
+
+    Args:
+        nearest: depth of the nearest things, metres.
+        middle: the median depth, metres.
+        scale: metres per count; None where metres were given.
+    """
+    if scale is None or nearest > _NEAR or middle > _ALL_NEAR or not (others := _likely_scales(nearest, scale)):
+        return None
+    return (
+        f"half of what is seen is within {middle:.2g} m of the camera, the nearest things at {nearest:.2g} m, nearer "
+        f"than most depth cameras see; if that is not so, depth_scale {scale:g} is wrong: {', '.join(others)}"
+    )
 
 
 def depths_beyond(diagonal: float, depth: float, scale: float | None) -> tuple[str, str]:
@@ -111,8 +144,8 @@ def depths_beyond(diagonal: float, depth: float, scale: float | None) -> tuple[s
     """
     if scale is None:
         return "depth", (
-            f"spans {diagonal:.0f} m with a median depth of {depth:.3g} m; floating point must be metres: divide "
-            "millimetres by 1000, or save them as whole numbers; check intrinsics, which must be in pixels"
+            f"spans {diagonal:.0f} m with a median depth of {depth:.3g} m; floating point must be metres: "
+            f"{_metres(depth)}; check intrinsics, which must be in pixels"
         )
     metres = depth * scale
     return "depth_scale", (
@@ -122,14 +155,29 @@ def depths_beyond(diagonal: float, depth: float, scale: float | None) -> tuple[s
 
 
 def _other_scales(depth: float, scale: float) -> str:
-    """The usual scales with which a depth (metres) would be a likely one."""
+    """What to do about a scale with which a depth (metres) is none that is likely."""
+    return ", ".join(_likely_scales(depth, scale)) or "give the metres of one count, 0.001 for millimetres"
+
+
+def _metres(depth: float) -> str:
+    """What makes metres of a depth (metres, as it was taken) in another unit."""
     low, high = _LIKELY_DEPTHS
     likely = [
+        f"divide {name} by {1 / factor:.4g} (then it is {depth * factor:.2g} m)"
+        for name, factor in UNITS.items()
+        if low <= depth * factor <= high
+    ]
+    return " or ".join(likely) or "save whole numbers and give depth_scale, the metres of one count"
+
+
+def _likely_scales(depth: float, scale: float) -> list[str]:
+    """The usual other scales with which a depth (metres) would be a likely one."""
+    low, high = _LIKELY_DEPTHS
+    return [
         f"counts of {name} need {other:g} (then it is {depth * other / scale:.2g} m)"
         for other, name in _COUNTS.items()
         if low <= depth * other / scale <= high and not np.isclose(other, scale)
     ]
-    return ", ".join(likely) or "give the metres of one count, 0.001 for millimetres"
 
 
 def depth_notes(camera: CameraIntrinsics, depths: NDArray[Any], scale: float | None, stride: int) -> list[str]:
@@ -143,8 +191,9 @@ def depth_notes(camera: CameraIntrinsics, depths: NDArray[Any], scale: float | N
     """
     notes = [principal_point(camera)]
     if len(depths) and min(camera.width, camera.height) >= _SMALLEST_IMAGE:
-        nearest = float(np.percentile(depths, _NEAR_SHARE)) * (1.0 if scale is None else scale)
-        notes += [depth_scale(nearest, scale), pixel_pitch(camera, nearest, stride, _CELL)]
+        nearest, middle = (np.percentile(depths, [_NEAR_SHARE, 50]) * (1.0 if scale is None else scale)).tolist()
+        wrong = depth_scale(nearest, scale) or all_near(nearest, middle, scale)
+        notes += [wrong, pixel_pitch(camera, nearest, stride, _CELL)]
     return [note for note in notes if note is not None]
 
 
@@ -157,24 +206,30 @@ _CELL = 0.0045
 # ------------------------------------------------------------------------------------------------------------ the cloud
 
 
-def cloud_notes(points: NDArray[np.float32], spacing: float, cell: float) -> list[str]:
-    """What is to be said of a prepared cloud.
+def cloud_notes(spacing: float, extent: float, cell: float) -> list[str]:
+    """What is to be said of a posted cloud.
 
     Args:
-        points: (P, 3).
-        spacing: the median distance from one of them to the nearest other one.
-        cell: of the grid that they lie on.
+        spacing: the median distance from one of its points to the nearest other one, metres.
+        extent: from side to side, metres.
+        cell: of the network's grid, metres.
     """
-    extent = span(points)
     notes = [unit(spacing, extent, cell), tiny(extent)]
     return [note for note in notes if note is not None]
 
 
-def answer_notes(best: float, points: NDArray[np.float32], max_width: float) -> list[str]:
-    """What is to be said where the best score (0 where nothing was found) of a prepared cloud (P, 3) is low."""
+def answer_notes(best: float, extent: float, extents: NDArray[np.float64], max_width: float) -> list[str]:
+    """What is to be said where the best score is low; 0 where nothing was found.
+
+    Args:
+        best: of the scores.
+        extent: of the posted cloud, from side to side, metres.
+        extents: (E,) of what grasps were looked for on, metres.
+        max_width: of the hand.
+    """
     if best >= LOW_SCORE:
         return []
-    notes = [low_scores(best, span(points)), too_wide(best, extents(points), max_width)]
+    notes = [low_scores(best, extent), too_wide(best, extents, max_width)]
     return [note for note in notes if note is not None]
 
 
@@ -186,9 +241,9 @@ def unit(spacing: float, extent: float, cell: float) -> str | None:
         extent: from side to side, metres.
         cell: of the network's grid, metres.
     """
-    if spacing <= _APART * cell:
+    if spacing <= APART * cell:
         return None
-    apart = f"the points lie {spacing * 1000:.0f} mm apart, over {_APART:g} of the {cell * 1000:g} mm cells of the grid"
+    apart = f"the points lie {spacing * 1000:.0f} mm apart, over {APART:g} of the {cell * 1000:g} mm cells of the grid"
     if extent >= _WIDE and (units := _likely_units(extent)):
         return f"{apart}, and span {extent:.1f} m; coordinates must be in metres: {units}"
     return f"{apart}: they describe no surface that a hand could close on; send a denser cloud, in metres"
@@ -201,6 +256,23 @@ def tiny(extent: float) -> str | None:
     return f"the cloud spans {extent * 1000:.2g} mm, less than anything to grasp; coordinates must be in metres"
 
 
+def crowded(posted: int, left: int, extent: float, cell: float) -> str | None:
+    """Whether a cloud is so small for its points that it may be in another unit, where too few are left on the grid.
+
+    Args:
+        posted: how many points were.
+        left: how many of them are left on the grid.
+        extent: of what was posted, from side to side, metres.
+        cell: of the grid, metres.
+    """
+    if extent > _SMALL or posted < _MANY:
+        return None
+    return (
+        f"the {posted} points posted span {extent * 1000:.2g} mm, of which {left} of the grid's {cell * 1000:g} mm "
+        "cells are left: coordinates must be in metres, and depth_scale of an image in metres per count"
+    )
+
+
 def low_scores(best: float, extent: float) -> str | None:
     """Whether a scale that would fit stands beside scores that are all low; nothing found is a best score of 0."""
     if best >= LOW_SCORE or extent < _LIKELY_SPANS[1] or not (units := _likely_units(extent)):
@@ -210,12 +282,12 @@ def low_scores(best: float, extent: float) -> str | None:
 
 
 def too_wide(best: float, extents: NDArray[np.float64], max_width: float) -> str | None:
-    """Whether all of a cloud's extents (3,) along its axes exceed the hand's opening, metres, and scores are low."""
+    """Whether all extents (E,) of what was looked at exceed the hand's opening, metres, and scores are low."""
     if best >= LOW_SCORE or extents.min() <= max_width:
         return None
     size = " x ".join(f"{extent:.2f}" for extent in sorted(extents, reverse=True))
     return (
-        f"what was sent measures {size} m along its axes, and the hand opens {max_width:g} m: if it is one thing, no "
+        f"what was looked at measures {size} m, and the hand opens {max_width:g} m: if it is one thing, no "
         "hand of this size fits it; check that it is in metres, or set a workspace"
     )
 
@@ -256,6 +328,11 @@ def extents(points: NDArray[Any]) -> NDArray[np.float64]:
     _, axes = np.linalg.eigh(centred.T @ centred)
     low, high = np.percentile(centred @ axes, [2, 98], axis=0)
     return np.asarray(high - low)
+
+
+def extents_across(points: NDArray[Any], sight: NDArray[np.float64]) -> NDArray[np.float64]:
+    """(2,) metres from side to side of points (N, 3) as they are seen along a unit direction (3,), as `extents`."""
+    return np.sort(extents(points - (points @ sight)[:, None] * sight))[1:]
 
 
 def _likely_units(extent: float) -> str:

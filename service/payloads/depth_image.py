@@ -69,7 +69,7 @@ def decode_depth(
         is_point=is_point.ravel(),
         mask=None if labels is None else labels.ravel(),
         viewpoint=T_cloud_camera.translation,
-        notes=tuple(plausibility.depth_notes(intrinsics, depths, scale, given.stride)),
+        notes=(*plausibility.depth_notes(intrinsics, depths, scale, given.stride), *_of_pose(T_cloud_camera)),
         **others,
     )
 
@@ -108,6 +108,11 @@ def _check_metres(points: Points, depths: NDArray[Any], scale: float | None) -> 
     if len(points) >= _FEW and np.isfinite(points).all() and (diagonal := span(points)) > MAX_DIAGONAL:
         field, message = plausibility.depths_beyond(diagonal, float(np.median(depths)), scale)
         raise Invalid(field, message)
+
+
+def _of_pose(T_cloud_camera: Pose) -> list[str]:
+    note = plausibility.camera_distance(float(np.linalg.norm(T_cloud_camera.translation)))
+    return [] if note is None else [note]
 
 
 def _pose(camera: DepthCamera) -> Pose:

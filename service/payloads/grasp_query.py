@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import math
 from typing import Any, Literal
 
 import numpy as np
@@ -93,8 +94,13 @@ def _check_count(payload: Payload, options: GraspOptions, target: Target | None,
     if payload.mask is not None and isinstance(target, np.ndarray):
         matter &= target
     count = int(np.count_nonzero(matter))
-    if count > max_points:
+    if count <= max_points:
+        return
+    if payload.viewpoint is None:
         raise TooManyPoints(count, max_points)
+    coarser = math.ceil(math.sqrt(count / max_points))
+    remedy = f"use {coarser} times its `stride`, or give a `workspace` or the `mask` of what to grasp"
+    raise TooManyPoints(count, max_points, remedy, "depth")
 
 
 def _target(payload: Payload, options: GraspOptions) -> tuple[Target | None, tuple[str, ...]]:

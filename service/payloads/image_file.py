@@ -51,7 +51,8 @@ def _array(array: NDArray[Any], name: str, kinds: str, max_pixels: int) -> NDArr
     image = array[..., 0] if array.ndim == 3 and array.shape[2] == 1 else array
     if image.ndim != 2 or not image.size or image.dtype.kind not in kinds:
         what = shortened(f"{array.dtype} of shape {array.shape}")
-        raise Invalid(name, f"is an array of {what}; save numbers in an array (height, width)")
+        numbers = "numbers" if "f" in kinds else "whole numbers, or true and false,"
+        raise Invalid(name, f"is an array of {what}; save {numbers} in an array (height, width)")
     _check_size(image.shape[1], image.shape[0], name, max_pixels)
     return image
 

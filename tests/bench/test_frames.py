@@ -9,7 +9,7 @@ import numpy as np
 import pytest
 
 from bench import frames
-from bench.rooms import Truth, overhead, photograph, table
+from bench.rooms import Truth, cabinet, overhead, photograph, small_table, table
 from tesnet.geometry import PANDA
 
 SQUARE = Truth(np.array([0.0, 0.0, 1.0]), 0.1, np.array([[0, 0, 0.1], [1, 0, 0.1], [1, 1, 0.1], [0, 1, 0.1]]))
@@ -19,15 +19,17 @@ def test_grasps_of_bare_frames_lie_on_things_of_the_table_and_hold_nothing(
     tmp_path: Path, service_url: str, capsys: pytest.CaptureFixture[str]
 ) -> None:
     rng = np.random.default_rng(5)
-    rooms = {"overhead": overhead(rng), "table": table(rng)}
-    frames.write_frames(tmp_path, ((name, photograph(room, (320, 240), 0.001, rng)) for name, room in rooms.items()))
+    rooms = {"cabinet": cabinet(rng), "overhead": overhead(rng), "small": small_table(rng), "table": table(rng)}
+    frames.write_frames(
+        tmp_path, ((name, photograph(room, (320, 240), 0.001, rng, 0.8)) for name, room in rooms.items())
+    )
     out = tmp_path / "counts.out"
     frames.main([str(tmp_path), "--bare", "--url", service_url, "--out", str(out)])
     counts = json.loads(out.read_text(encoding="utf-8"))
-    assert [one["name"] for one in counts] == ["overhead", "table"]
-    assert sum(one["grasps"] for one in counts) == 20
+    assert [one["name"] for one in counts] == ["cabinet", "overhead", "small", "table"]
+    assert sum(one["grasps"] for one in counts) == 40
     assert sum(one["colliding"] for one in counts) == 0
-    assert sum(one["on_things"] for one in counts) >= 18
+    assert sum(one["on_things"] for one in counts) >= 36
     assert all(any("up auto" in note for note in one["warnings"]) for one in counts)
     assert "on things" in capsys.readouterr().out
 

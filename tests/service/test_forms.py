@@ -414,6 +414,28 @@ def test_the_limit_of_points_concerns_those_that_matter() -> None:
             build_query(payload, parse_options(payload.options), count - 1)
 
 
+def test_an_image_of_too_many_points_has_stride_workspace_and_mask_named() -> None:
+    image = np.full((30, 40), 500, np.uint16)
+    options = {"intrinsics": {"fx": 40.0, "fy": 40.0, "cx": 20.0, "cy": 15.0}}
+    payload = form_decoder({"depth": npy(image)})(options)
+    with pytest.raises(
+        TooManyPoints, match=r"use 3 times its `stride`, or give a `workspace` or the `mask`"
+    ) as refused:
+        build_query(payload, parse_options(payload.options), 140)
+    assert refused.value.field == "depth"
+    coarser = form_decoder({"depth": npy(image)})({**options, "stride": 3})
+    build_query(coarser, parse_options(coarser.options), 140)
+
+
+def test_a_mask_that_is_no_mask_is_told_to_be_of_whole_numbers(http: httpx.Client) -> None:
+    view = box_on_table()
+    floats = np.zeros(view.counts.shape)
+    problem = problem_of(
+        post(http, {"depth": png(view.counts), "mask": npy(floats)}, view.camera), 422, "whole numbers"
+    )
+    assert problem.field == "mask"
+
+
 def test_an_image_of_eight_million_pixels_takes_little_more_memory_than_its_points() -> None:
     image = np.full((2160, 3840), 500, np.uint16)
     decode = form_decoder({"depth": npy(image)})

@@ -13,6 +13,7 @@ from scipy.spatial import cKDTree
 from torch import Tensor
 
 from tesnet import cloud, smoothing
+from tesnet.depth_noise import DepthNoise
 from tesnet.geometry import Box, Pose
 from tesnet.query import GraspQuery
 from tesnet.support import SupportPlane
@@ -228,13 +229,13 @@ def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: f
     """Whether grasps are looked for there or not; a plane of little noise keeps the usual distance."""
     points = np.random.default_rng(0).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.06], (20_000, 3))
     sides = np.array([[1.0, 0, 0, 0.2], [-1.0, 0, 0, 0.2], [0, 1.0, 0, 0.2], [0, -1.0, 0, 0.2]])
-    plane = SupportPlane(UP, 0.0, 0.5, noise_sd, sides)
+    plane = SupportPlane(UP, 0.0, 0.5, 0.1, noise_sd, sides, DepthNoise(CAMERA[None], noise_sd, 0.0))
     query = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0)
     ready = cloud.prepare(query, cloud.PreparationConfig(), CPU, plane)
     assert ready is not None
     positions = [ready.points] if ready.unsought is None else [ready.points, ready.unsought.points]
     heights = ready.T_cloud_canonical.apply(torch.cat(positions).numpy())[:, 2]
-    lowest = max(cloud.SUPPORT_NOISE, 3 * noise_sd)
+    lowest = max(cloud.SUPPORT_NOISE, 4 * noise_sd)
     assert lowest - 1e-6 <= heights.min() < lowest + 0.003
     assert ready.support_error == noise_sd
 
@@ -276,6 +277,23 @@ def test_of_a_support_that_is_seen_about_its_height_no_more_than_its_noise_is_dr
     assert float(heights.min()) == pytest.approx(lowest + 0.001, abs=0.0015)
 
 
+def test_where_the_noise_of_a_given_support_grows_with_the_distance_as_much_more_is_dropped() -> None:
+    """Four standard deviations at each place, and what is lifted over that and stands alone."""
+    rng = np.random.default_rng(0)
+    table = np.column_stack([rng.uniform(-0.8, 0.8, (60_000, 2)), np.zeros(60_000)])
+    sd = 0.0012 * np.linalg.norm(table - CAMERA, axis=1)
+    table[:, 2] = sd * rng.standard_normal(len(table))
+    far, near = (rng.uniform([x, -0.05, 0.0], [x + 0.1, 0.05, 0.03], (4000, 3)) for x in (-0.75, 0.5))
+    query = ask(np.concatenate([table, far, near]), viewpoints=CAMERA, up=UP, support_height=0.0)
+    ready = prepared(query, smooth_above=0.05)
+    positions = ready.T_cloud_canonical.apply(ready.points.numpy())
+    among = [(np.abs(positions[:, 0] - x) < 0.06) & (np.abs(positions[:, 1]) < 0.06) for x in (-0.7, 0.55)]
+    assert (among[0] | among[1]).mean() > 0.97
+    for mask, x in zip(among, (-0.7, 0.55), strict=True):
+        reach = 4 * 0.0012 * np.linalg.norm(CAMERA - [x, 0, 0])
+        assert positions[mask, 2].min() == pytest.approx(max(reach, 0.0045), abs=0.0015)
+
+
 def test_a_cloud_is_as_noisy_as_its_own_surfaces_or_its_support_whichever_is_noisier() -> None:
     config = cloud.PreparationConfig(smooth_above=0.0015)
     quiet = torch.from_numpy(tabletop(0)).float()
@@ -297,7 +315,7 @@ def test_of_much_that_stands_on_a_found_support_the_nearest_to_the_camera_is_loo
     """The rest still blocks hands; where nothing was found, or a target given, the usual limit holds."""
     points = np.random.default_rng(0).uniform([-0.15, -0.15, 0.02], [0.15, 0.15, 0.06], (60_000, 3))
     sides = np.array([[1.0, 0, 0, 0.3], [-1.0, 0, 0, 0.3], [0, 1.0, 0, 0.3], [0, -1.0, 0, 0.3]])
-    plane = SupportPlane(UP, 0.0, 0.5, 0.001, sides)
+    plane = SupportPlane(UP, 0.0, 0.5, 0.1, 0.001, sides, DepthNoise(CAMERA[None], 0.001, 0.0))
     query = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0)
     targeted = ask(points, viewpoints=CAMERA, up=UP, support_height=0.0, target=Box(np.full(3, -1.0), np.full(3, 1.0)))
     config = cloud.PreparationConfig()

@@ -22,3 +22,4 @@ def test_errors_carry_what_a_caller_decides_by() -> None:
     large = errors.TooManyPoints(7, 5)
     assert (large.count, large.limit) == (7, 5)
     assert str(large) == "The cloud has 7 points (limit 5); crop or downsample it."
+    assert large.field is None

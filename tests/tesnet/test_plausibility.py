@@ -72,7 +72,8 @@ def test_pixels_farther_apart_than_cells_are_named() -> None:
         (2.5, 0.001, "counts of 1/5000 m need 0.0002 (then it is 0.5 m)"),
         (0.04, 0.0001, "counts of 1 mm need 0.001 (then it is 0.4 m)"),
         (500.0, 1.0, "counts of 1 mm need 0.001"),
-        (700.0, None, "must be metres"),
+        (700.0, None, "divide millimetres by 1000 (then it is 0.7 m)"),
+        (70.0, None, "divide centimetres by 100 (then it is 0.7 m)"),
     ],
 )
 def test_a_wrong_depth_scale_is_named_with_the_likely_one(depth: float, scale: float | None, words: str) -> None:
@@ -87,7 +88,37 @@ def test_what_spans_too_much_is_blamed_on_the_field_of_an_image() -> None:
     assert field == "depth_scale"
     assert "0.001" in message
     assert "millimetres by 1000" not in message
-    assert plausibility.depths_beyond(300.0, 500.0, None)[0] == "depth"
+    field, message = plausibility.depths_beyond(60.0, 80.0, None)
+    assert field == "depth"
+    assert "divide centimetres by 100" in message
+    assert "millimetres" not in message
+
+
+@pytest.mark.parametrize("factor", [0.1, 0.2, 0.25])
+@pytest.mark.parametrize("scale", [0.001, 0.0002])
+def test_a_scale_that_brings_all_of_an_image_near_is_named_where_a_usual_one_would_fit(
+    factor: float, scale: float
+) -> None:
+    said = plausibility.all_near(0.6 * factor, 0.9 * factor, scale * factor)
+    assert said is not None
+    assert f"need {scale:g} (then it is 0.6 m)" in said
+    assert plausibility.all_near(0.1, 0.4, scale) is None  # such as fingers before a table
+    assert plausibility.all_near(0.6 * factor, 0.9 * factor, None) is None
+
+
+def test_an_image_in_a_tenth_of_its_scale_is_named_and_at_its_own_it_is_not() -> None:
+    depths = np.random.default_rng(0).integers(600, 1200, 5000)
+    (said,) = plausibility.depth_notes(CAMERA, depths, 0.0002, 1)
+    assert "counts of 1 mm need 0.001" in said
+    assert plausibility.depth_notes(CAMERA, depths, 0.001, 1) == []
+
+
+def test_many_points_of_which_few_are_left_are_of_another_unit_where_they_lie_close() -> None:
+    said = plausibility.crowded(20_000, 12, 0.009, CELL)
+    assert said is not None
+    assert "20000 points posted span 9 mm" in said
+    assert plausibility.crowded(20_000, 12, 1.5, CELL) is None
+    assert plausibility.crowded(20, 12, 0.009, CELL) is None
 
 
 def test_the_notes_of_a_usual_image_are_none_and_those_of_small_ones_too() -> None:
@@ -124,13 +155,14 @@ def test_a_cloud_smaller_than_anything_to_grasp_is_named() -> None:
 def test_low_scores_are_put_down_to_the_scale_only_where_another_one_would_fit() -> None:
     rng = np.random.default_rng(0)
     thing = rng.uniform(-0.05, 0.05, (500, 3)).astype(np.float32)
-    assert plausibility.answer_notes(0.9, 50 * thing, 0.08) == []
-    scale, extent = plausibility.answer_notes(0.1, 50 * thing, 0.08)
+    extents = plausibility.extents(thing)
+    assert plausibility.answer_notes(0.9, 7.0, 50 * extents, 0.08) == []
+    scale, extent = plausibility.answer_notes(0.1, 7.0, 50 * extents, 0.08)
     assert "no score is over 0.10" in scale
     assert "centimetres" in scale
     assert "no hand of this size fits it" in extent
-    assert plausibility.answer_notes(0.0, thing * np.array([1, 1, 0.5], np.float32), 0.08) == []
-    assert "nothing was found" in plausibility.answer_notes(0.0, 50 * thing, 0.08)[0]
+    assert plausibility.answer_notes(0.0, 0.15, extents * [1, 1, 0.5], 0.08) == []
+    assert "nothing was found" in plausibility.answer_notes(0.0, 7.0, 50 * extents, 0.08)[0]
 
 
 @given(st.integers(0, 100))
@@ -159,3 +191,20 @@ def test_a_viewpoint_with_points_on_all_sides_is_within_the_cloud() -> None:
     assert "within the cloud" in said
     assert plausibility.enclosed_viewpoint(ball, np.array([0.3, 0.1, 0.2])) is None
     assert plausibility.enclosed_viewpoint(40 * ball, np.zeros(3)) is None
+
+
+def test_a_camera_placed_in_millimetres_is_named_and_one_in_metres_or_far_away_is_not() -> None:
+    said = plausibility.camera_distance(500.0)
+    assert said is not None
+    assert "divide its translation by 1000" in said
+    for distance in (0.0, 0.5, 3.0, 20.0, 20_000.0):
+        assert plausibility.camera_distance(distance) is None
+
+
+@pytest.mark.parametrize("seed", range(5))
+def test_extents_across_the_sight_are_those_of_what_is_seen(seed: int) -> None:
+    """Of a face that is seen straight on, whose thickness is not."""
+    rng = np.random.default_rng(seed)
+    turn, _ = np.linalg.qr(rng.normal(size=(3, 3)))
+    face = rng.uniform(-1, 1, (4000, 3)) * [0.15, 0.1, 0.0005] @ turn.T
+    np.testing.assert_allclose(plausibility.extents_across(face, turn[:, 2]), [0.192, 0.288], rtol=0.03)

@@ -11,8 +11,10 @@ from unittest.mock import Mock
 import numpy as np
 import pytest
 import torch
+from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 
+from bench import rooms
 from tesnet import cloud, collision, networks, notices, weights
 from tesnet import predictor as predictor_module
 from tesnet.errors import DeviceError, GaveUp, WeightsError
@@ -594,3 +596,44 @@ def test_another_hand_is_warned_of_where_the_network_does_not_know_it(knows_hand
 @pytest.mark.parametrize("told", [True, False])
 def test_a_network_knows_hands_where_it_is_told_of_them(told: bool) -> None:
     assert networks.build("tesnet", {"told": told}).knows_hands == told
+
+
+def face(half: tuple[float, float, float], count: int, seed: int = 0) -> NDArray[np.float64]:
+    """Points (count, 3) of the three sides of a box that are seen from +x, +y, +z."""
+    rng = np.random.default_rng(seed)
+    points = rng.uniform(-1, 1, (count, 3)) * half
+    rows, side = np.arange(count), rng.integers(0, 3, count)
+    points[rows, side] = np.array(half)[side]
+    return points + rng.normal(0, 0.0003, points.shape)
+
+
+@pytest.mark.parametrize("count", [6000, 200_000])
+def test_the_unit_is_judged_by_what_was_posted_however_much_of_it_is_looked_at(count: int) -> None:
+    result = fresh_predictor().predict(ask(100 * face((0.03, 0.025, 0.06), count), viewpoints=[40.0, 40, 50]))
+    assert any("centimetres" in note for note in result.warnings)
+    assert not any("inches" in note and "centimetres" not in note for note in result.warnings)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.002, 0.003])
+@pytest.mark.parametrize("given", ["auto", "up", "height"])
+def test_the_noise_of_an_empty_plane_is_not_grasped(noise: float, given: str) -> None:
+    """Nor is it taken for a cloud in another unit."""
+    rng = np.random.default_rng(0)
+    frame = rooms.photograph(rooms.empty(rng), (320, 240), noise, rng)
+    points, truth = frame.intrinsics.back_project(frame.counts * rooms.DEPTH_SCALE), frame.truth
+    options: dict[str, Any] = {"up": "auto"} if given == "auto" else {"up": truth.up, "support_height": "auto"}
+    if given == "height":
+        options["support_height"] = truth.height
+    result = fresh_predictor().predict(ask(points, viewpoints=np.zeros(3), **options))
+    assert len(result.grasps) == 0
+    assert not any("inches" in note for note in result.warnings)
+
+
+def test_a_box_under_the_camera_that_is_wider_than_the_hand_is_named() -> None:
+    top = np.random.default_rng(0).uniform([-0.15, -0.15, 0.1], [0.15, 0.15, 0.1], (20_000, 3))
+    table = np.random.default_rng(1).uniform([-0.5, -0.5, 0.0], [0.5, 0.5, 0.0], (20_000, 3))
+    table = table[(np.abs(table[:, :2]) > 0.18).any(axis=1)]
+    asked = ask(np.concatenate([top, table]), viewpoints=[0, 0, 0.8], up=UP, support_height="auto")
+    result = fresh_predictor().predict(asked)
+    assert len(result.grasps) == 0
+    assert any("no hand of this size fits it" in note for note in result.warnings)

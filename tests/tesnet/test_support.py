@@ -11,8 +11,10 @@ import pytest
 from numpy.typing import NDArray
 
 from bench import rooms
+from bench.solids import Block, Placed, standing
 from tesnet import support
 from tesnet.cloud import SUPPORT_NOISE
+from tesnet.depth_noise import DepthNoise
 from tesnet.geometry import Box, Pose
 from tesnet.planes import SQUARE, Plane, basis
 from tesnet.query import GraspQuery
@@ -37,7 +39,7 @@ def test_the_table_under_objects_is_found_to_a_millimetre_wherever_the_frame_lie
     points = np.concatenate([tabletop(seed), table()])
     points += rng.normal(0, noise, points.shape)
     motion = Pose.random(rng, reach=0.5) if seed else Pose.identity()
-    found = support.find(auto(motion.apply(points), up=motion.rotate(UP)))
+    found = support.find(auto(motion.apply(points), viewpoints=motion.apply(CAMERA), up=motion.rotate(UP)))
     assert found is not None
     expected = float(motion.translation @ motion.rotate(UP))
     assert abs(found.height - expected) < 0.001
@@ -168,8 +170,9 @@ def test_the_region_is_that_of_a_loop_over_its_points(seed: int, noise_sd: float
     up = pose.rotate(np.array([0.0, 0.0, 1.0]))
     normals = pose.rotate(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]))
     sides = np.column_stack([normals, normals @ pose.translation + [0.15, 0.15, 0.1, 0.1]])
-    plane = support.SupportPlane(up, float(up @ pose.translation), 0.5, noise_sd, sides)
-    lowest = max(0.003, 3 * noise_sd)
+    noise = DepthNoise(np.zeros((1, 3)), noise_sd, 0.0)
+    plane = support.SupportPlane(up, float(up @ pose.translation), 0.5, 0.06, noise_sd, sides, noise)
+    lowest = max(0.003, 4 * noise_sd)
     distances = [[abs(abs(x) - 0.13), abs(abs(y) - 0.08), abs(z - lowest), abs(z - 0.35)] for x, y, z in local.tolist()]
     clear = np.min(distances, axis=1) > 1e-5  # of every limit, whichever way float32 rounds
     expected = [abs(x) < 0.13 and abs(y) < 0.08 and lowest < z < 0.35 for x, y, z in local.tolist()]
@@ -178,33 +181,28 @@ def test_the_region_is_that_of_a_loop_over_its_points(seed: int, noise_sd: float
     assert 100 < found.sum() < 3000
 
 
-def worth_of(
-    up: Array, height: float, noise: float, points: Array, own: NDArray[np.bool_], sides: Array, eye: Any
-) -> float:
-    """`support._worth` a point at a time."""
-    across = basis(up)
-    uv, heights = points @ across[:, :2], points @ up - height
+def by_a_loop(plane: Plane, noise: float, points: Array, eye: Any) -> tuple[bool, int]:
+    """`support._is_surface` and `support._things`, a point at a time."""
+    across = basis(plane.up)
+    uv, heights = points @ across[:, :2], points @ plane.up - plane.height
     squares = [tuple(square) for square in np.floor(uv / SQUARE).astype(int).tolist()]
-    area = len({square for square, is_own in zip(squares, own, strict=True) if is_own}) * SQUARE**2
-    inside = [all(point @ side[:3] <= side[3] for side in sides) for point in points]
+    area = len({square for square, is_own in zip(squares, plane.own, strict=True) if is_own}) * SQUARE**2
+    inside = [all(point @ side[:3] <= side[3] for side in plane.sides) for point in points]
     below = sum(one and h < -0.015 for one, h in zip(inside, heights, strict=True))
-    if area < 0.008 or (area < 0.09 and below > 0.2 * own.sum()):
-        return 0.0
-    if eye is not None and (over := eye @ up - height) > 0:
-        through = 0
+    is_surface = not (area < 0.008 or (area < 0.09 and below > 0.2 * plane.own.sum()))
+    if eye is not None:
+        over, through = eye @ plane.up - plane.height, 0
         for point, h in zip(points, heights, strict=True):
             crossing = eye + over / (over - h) * (point - eye)
-            through += h < -0.015 and all(crossing @ side[:3] <= side[3] - SQUARE for side in sides)
-        if through > 0.15 * own.sum():
-            return 0.0
-    least = max(0.003, 3 * noise)
+            through += h < -0.015 and all(crossing @ side[:3] <= side[3] - SQUARE for side in plane.sides)
+        is_surface = is_surface and through <= 0.15 * plane.own.sum()
+    well_inside = [all(point @ side[:3] <= side[3] - 0.02 for side in plane.sides) for point in points]
     highest: dict[tuple[int, ...], float] = {}
-    things = [one and h > least for one, h in zip(inside, heights, strict=True)]
-    for square, thing, h in zip(squares, things, heights, strict=True):
-        if thing:
-            highest[square] = max(highest.get(square, -np.inf), h)
-    count = sum(thing and highest[square] <= 0.35 for square, thing in zip(squares, things, strict=True))
-    return float(np.sqrt(own.sum()) * (np.sqrt(count) if count >= 15 else 1.0))
+    for square, h in zip(squares, heights, strict=True):
+        highest[square] = max(highest.get(square, -np.inf), h)
+    least = max(0.003, 4 * noise)
+    things = zip(squares, well_inside, heights, strict=True)
+    return is_surface, sum(one and h > least and highest[square] <= 0.35 for square, one, h in things)
 
 
 @pytest.mark.parametrize("seed", range(40))
@@ -219,10 +217,89 @@ def test_what_speaks_for_a_plane_is_what_a_loop_over_the_points_counts(seed: int
     own = np.zeros(len(local), dtype=bool)
     own[:400] = True
     pose = Pose.random(rng, reach=0.2)
-    eye = None if seed % 4 == 0 else pose.apply(rng.uniform([-0.5, -0.5, -0.2], [0.5, 0.5, 0.6]))
+    eye = None if seed % 4 == 0 else pose.apply(rng.uniform([-0.5, -0.5, 0.1], [0.5, 0.5, 0.6]))
     points, up = pose.apply(local), pose.rotate(np.array([0.0, 0.0, 1.0]))
     normals = pose.rotate(np.array([[1.0, 0, 0], [-1, 0, 0], [0, 1, 0], [0, -1, 0]]))
     sides = np.column_stack([normals, normals @ pose.translation + np.repeat(half, 2)])
     noise, height = float(rng.choice([0.0005, 0.003])), float(up @ pose.translation)
-    found = support._worth(Plane(up, height, noise, sides, own), points, eye)
-    assert found == pytest.approx(worth_of(up, height, noise, points, own, sides, eye), rel=1e-9)
+    plane = Plane(up, height, noise, sides, own)
+    place = support.SupportPlane(up, height, 0.5, 0.1, noise, sides, DepthNoise(np.zeros((1, 3)), noise, 0.0))
+    is_surface, count = by_a_loop(plane, noise, points, eye)
+    assert support._is_surface(plane, support._area(plane, points), points, eye) == is_surface
+    assert support._things(points.astype(np.float32), place) == pytest.approx(count, abs=1)  # as float32 rounds
+
+
+def thing(x: float, y: float, size: float, height: float) -> Placed:
+    return Block(np.full(3, size / 2)), standing(x, y, height + size / 2, 0.4)
+
+
+def small_table(length: float, depth: float, height: float, things: tuple[Placed, ...]) -> rooms.Room:
+    """A table with the floor in view, from a metre away."""
+    eye = np.array([0, -0.7, height + 0.73])
+    solids = (rooms._floor(), *rooms._desk(length, depth, height), *things)
+    return rooms.Room(solids, eye, np.array([0, 0, height]), height, rooms._corners(length, depth))
+
+
+@pytest.mark.parametrize("noise", [0.0, 0.0005, 0.001, 0.002])
+@pytest.mark.parametrize("up", ["auto", "given"])
+@pytest.mark.parametrize(
+    "sizes", [(0.03,), (0.05, 0.04), (0.012, 0.05, 0.04)], ids=["one", "two", "three"]
+)  # fmt: skip
+def test_few_small_things_on_a_small_table_are_more_than_the_noise_of_the_floor(
+    noise: float, up: str, sizes: tuple[float, ...]
+) -> None:
+    """Which grows with the square of the distance."""
+    places = [(0.0, 0.0), (0.1, 0.08), (-0.15, 0.05)]
+    things = tuple(thing(*place, size, 0.72) for place, size in zip(places, sizes, strict=False))
+    room = small_table(0.6, 0.5, 0.72, things)
+    frame = rooms.photograph(room, rooms.VGA, noise, np.random.default_rng(0))
+    assert_support_is_the_truth(frame, up)
+
+
+@pytest.mark.parametrize("focal_share", [0.5, 0.7, 0.95])
+@pytest.mark.parametrize("kind", ["legs", "cabinet", "stairs"])
+@pytest.mark.parametrize("up", ["auto", "given"])
+def test_what_is_below_the_edge_of_a_nearer_plane_is_no_thing_on_the_floor(
+    focal_share: float, kind: str, up: str
+) -> None:
+    rng = np.random.default_rng(1)
+    room = {"legs": rooms.small_table, "cabinet": rooms.cabinet, "stairs": rooms.stairs}[kind](rng)
+    assert_support_is_the_truth(rooms.photograph(room, rooms.VGA, 0.001, rng, focal_share), up)
+
+
+def assert_support_is_the_truth(frame: rooms.RoomFrame, up: str) -> None:
+    points, truth = frame.intrinsics.back_project(frame.counts * rooms.DEPTH_SCALE), frame.truth
+    plane = support.find(auto(points, viewpoints=np.zeros(3), up="auto" if up == "auto" else truth.up))
+    assert plane is not None
+    assert plane.up @ truth.up > np.cos(np.deg2rad(1.5))
+    assert plane.height == pytest.approx(truth.height, abs=0.006)
+
+
+@pytest.mark.parametrize("noise", [0.001, 0.002, 0.004])
+def test_hardly_a_point_of_an_empty_plane_is_in_its_region_however_its_noise_grows(noise: float) -> None:
+    rng = np.random.default_rng(0)
+    frame = rooms.photograph(rooms.empty(rng), rooms.VGA, noise, rng)
+    points = frame.intrinsics.back_project(frame.counts * rooms.DEPTH_SCALE)
+    plane = support.find(auto(points, viewpoints=np.zeros(3), up="auto"))
+    assert plane is not None
+    assert support.region(points.astype(np.float32), plane).sum() < 3e-4 * len(points)
+
+
+def test_up_alone_before_a_large_plane_has_the_remedy_named_and_before_things_alone_nothing() -> None:
+    table_with_things = ask(np.concatenate([tabletop(0), table()]), viewpoints=CAMERA, up=UP)
+    query, plane, (note,) = support.settled(table_with_things)
+    assert query is table_with_things
+    assert plane is None
+    assert "the plane at 0.0000 m along up" in note
+    assert 'give that height, or support_height: "auto"' in note
+    assert support.settled(ask(tabletop(0), viewpoints=CAMERA, up=UP))[2] == []
+
+
+@pytest.mark.parametrize("height", ["auto", None])
+def test_an_up_that_points_away_from_the_camera_is_named_and_with_auto_left_out(height: Any) -> None:
+    reversed_up = ask(np.concatenate([tabletop(0), table()]), viewpoints=CAMERA, up=-UP, support_height=height)
+    query, plane, (note,) = support.settled(reversed_up)
+    assert plane is None
+    assert "reverse it" in note
+    assert (query.up is None) == (height == "auto")
+    assert query.support_height is None
