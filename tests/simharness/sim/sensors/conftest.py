@@ -35,4 +35,5 @@ def block(camera: CameraIntrinsics) -> Array:
     """Depth (H, W) of a wall at 0.8 m with a square at 0.6 m, rows 180-299, columns 260-379, in front of it."""
     depth = np.full((camera.height, camera.width), 0.8)
     depth[180:300, 260:380] = 0.6
+    depth.setflags(write=False)  # all tests share it
     return depth
