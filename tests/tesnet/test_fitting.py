@@ -254,3 +254,17 @@ def test_a_hand_has_the_opening_of_the_place_where_it_stands(
         assert torch.equal(placed.Ts_canonical_grasp, expected.Ts_canonical_grasp)
         assert torch.equal(placed.contact, found.contact)
     assert policy == "full" or not centred or elsewhere > 0
+
+
+def test_no_wall_is_guessed_more_than_20_mm_beyond_what_was_seen() -> None:
+    radius, last = 0.037, np.radians(108)
+    rng = np.random.default_rng(1)
+    angle = rng.uniform(np.radians(-20), last, 12_000)
+    points = np.column_stack([rng.uniform(-0.06, 0.06, 12_000), radius * np.cos(angle), 0.05 + radius * np.sin(angle)])
+    cloud = prepared(ask(points, viewpoints=[[0.0, 0.6, 0.4]], up=UP, support_height=0.0))
+    found = towards_y(cloud, centred=False)
+    span = fitting.spans(cloud, found)
+    far = exact_y(cloud, found) - (span.near - span.far).double().numpy()
+    seen = radius * np.cos(last)
+    assert far.min() >= seen - 0.02 - 0.002
+    assert (far < seen - 0.02 + 0.002).mean() > 0.3  # though the circle ends 26 mm beyond it

@@ -9,7 +9,7 @@ import torch
 
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Box, Pose
-from tesnet.outline import Outline, is_low, outline
+from tesnet.outline import Outline, _drop, is_low, outline
 from tesnet.query import GraspQuery
 from tests.tesnet.raycast import OVERHEAD, Can, Slab, overhead_query
 from tests.tesnet.scenes import UP, Array, ask, bare_cloud, prepared, tabletop_query
@@ -157,3 +157,13 @@ def test_low_is_what_lies_less_than_17_mm_over_a_plane_that_is_known(seed: int) 
     assert is_low(cloud).tolist() == [True, True, True, True, False, False]
     for unknown in (replace(cloud, up=None), replace(cloud, support_height=None)):
         assert not is_low(unknown).any()
+
+
+def test_beyond_low_faces_less_of_a_drop_is_enough_but_never_none() -> None:
+    heights = np.array([-0.001, 0.0, 0.001, 0.0025, 0.004, 0.01, 0.02, 0.2])
+    points = np.column_stack([np.zeros((8, 2)), heights])
+    cloud = replace(bare_cloud(points), up=torch.tensor([0.0, 0.0, 1.0]), support_height=0.0)
+    every = torch.arange(8)
+    expected = [0.0015, 0.0015, 0.0015, 0.0015, 0.0024, 0.006, 0.006, 0.006]
+    assert _drop(cloud, every)[:, 0].tolist() == pytest.approx(expected, abs=1e-6)
+    assert _drop(replace(cloud, support_height=None), every)[:, 0].tolist() == pytest.approx([0.006] * 8)

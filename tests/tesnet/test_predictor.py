@@ -17,6 +17,7 @@ from scipy.spatial import cKDTree
 from bench import rooms
 from tesnet import cloud, collision, networks, notices, weights
 from tesnet import predictor as predictor_module
+from tesnet.candidates import CandidateConfig, generate
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import PANDA, Box
 from tesnet.hands import HANDS
@@ -32,6 +33,7 @@ from tests.tesnet.scenes import (
     fresh_network,
     fresh_predictor,
     open_hands,
+    prepared,
     tabletop,
     tabletop_query,
 )
@@ -637,3 +639,16 @@ def test_a_box_under_the_camera_that_is_wider_than_the_hand_is_named() -> None:
     result = fresh_predictor().predict(asked)
     assert len(result.grasps) == 0
     assert any("no hand of this size fits it" in note for note in result.warnings)
+
+
+def test_candidates_that_hold_posted_points_after_all_count_as_collisions_with_those_before() -> None:
+    query = tabletop_query(max_candidates=60)
+    ready = prepared(query)
+    free = generate(ready, query, CandidateConfig())[0]
+    found = predictor_module._Free(free, 100, {"support": 3, "collision": 7})
+    clear = torch.ones(len(free), dtype=torch.bool)
+    clear[[0, 4, 5]] = False
+    left = found.only(clear)
+    assert left.rejected == {"support": 3, "collision": 10}
+    assert (len(left.free), left.count) == (len(free) - 3, 100)
+    assert torch.equal(left.free.approach, free.approach[clear])

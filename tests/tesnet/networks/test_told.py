@@ -97,3 +97,13 @@ def test_noise_grows_with_the_sensors_and_stays_under_a_rigid_motion() -> None:
     assert levels[0] < 0.05
     assert levels[1] > 0.2
     assert (np.diff(levels) > 0.1).all()
+
+
+def test_tips_that_would_find_nothing_are_told_the_advance_of_the_closed_hand() -> None:
+    hand = HANDS["rg2"].gripper
+    ready, found = example()
+    found = replace(found, gripper=hand, widths=torch.linspace(0.02, hand.max_width, len(found)))
+    nowhere = torch.zeros(len(found), 1, 3)
+    inputs = told_inputs(ready, found, nowhere, torch.zeros(len(found), dtype=torch.bool))
+    expected = [(hand.tcp_at(0.0) - hand.tcp_at(width)) / 0.02 for width in found.widths.tolist()]
+    torch.testing.assert_close(inputs[:, -1].double(), torch.tensor(expected, dtype=torch.float64), atol=1e-5, rtol=0)
