@@ -24,6 +24,7 @@ from tesnet import formats
 from tesnet.errors import InvalidQuery, TooManyPoints, UnreadableFile
 from tesnet.formats import NPY, PCD, PLY, TEXT, CloudFile, text
 from tesnet.formats import ply as ply_module
+from tesnet.formats.cloud_file import given_viewpoint
 
 Array = NDArray[Any]
 Reader = Callable[..., CloudFile]
@@ -510,3 +511,14 @@ def test_lists_that_change_their_length_too_often_are_refused_before_they_cost_s
     np.testing.assert_array_equal(
         read_ply(head + b"end_header\n" + b"0 " * 20 + b"1 7 " * 20 + b"1 2 3").points, [[1, 2, 3]]
     )
+
+
+@pytest.mark.parametrize(
+    ("place", "given"),
+    [((0, 0, 0), False), ((0, 0, 1), True), ((1, 0, 0), True), ((0.1, 0.2, 0.3), True), ((np.nan, 1, 1), False)],
+)
+def test_a_viewpoint_at_the_origin_or_nowhere_is_none(place: tuple[float, float, float], given: bool) -> None:
+    found = given_viewpoint(np.array(place))
+    assert (found is not None) == given
+    if found is not None:
+        assert found.tolist() == list(place)

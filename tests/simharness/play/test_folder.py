@@ -8,6 +8,7 @@ from typing import Any
 import pytest
 
 from simharness.errors import UsageError
+from simharness.play import folder as folder_module
 from simharness.play.folder import RunFolder
 from simharness.play.records import RoundRecord, Run
 from tests.simharness.recorded import MODEL, SERVING
@@ -101,3 +102,19 @@ def test_files_are_rewritten_in_the_order_of_seeds_rounds_and_attempts(tmp_path:
         keys = [(line["seed"], line["round"], line["attempt"] if name == "attempts.jsonl" else 0) for line in lines]
         assert keys == sorted(keys)
     assert same(folder.read_rounds(), list(run.rounds))
+
+
+def test_nothing_of_an_earlier_run_is_left_among_the_files_of_a_new_one(tmp_path: Path, make_settings: Any) -> None:
+    folder = RunFolder(tmp_path)
+    folder.prepare(make_settings(), resume=False)
+    names = {value for name, value in vars(folder_module).items() if name.endswith(("_FILE", "_LOG"))}
+    assert len(names) == 7
+    for name in names:
+        (tmp_path / name).write_text("{}\n")
+    (folder.pictures / "one.png").write_bytes(b"png")
+    folder.prepare(make_settings(), resume=False)
+    aside = tmp_path / "earlier-1"
+    assert {path.name for path in tmp_path.iterdir()} == {"earlier-1", folder.pictures.name}
+    assert {path.name for path in aside.iterdir()} == names | {folder.pictures.name}
+    assert (aside / folder.pictures.name / "one.png").exists()
+    assert not list(folder.pictures.iterdir())

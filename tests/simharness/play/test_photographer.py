@@ -22,3 +22,9 @@ def test_pictures_that_are_not_shown_are_removed(make_round: Any, tmp_path: Path
         (tmp_path / picture_name(attempt, "cloud")).write_bytes(b"")
     keep_only(tmp_path, [kept])
     assert [path.name for path in tmp_path.iterdir()] == [picture_name(kept, "cloud")]
+
+
+def test_a_first_attempt_that_failed_is_shown_once(make_round: Any) -> None:
+    shown = attempts_to_show([make_round(0, number, ["slip", "slip"]) for number in range(FIRST_ROUNDS)], 0)
+    places = [(attempt.round, attempt.attempt) for attempt in shown]
+    assert len(set(places)) == len(places) == FIRST_ROUNDS + min(FAILURES, FIRST_ROUNDS)

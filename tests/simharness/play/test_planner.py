@@ -10,7 +10,7 @@ import numpy as np
 import pytest
 
 from simharness.errors import RunBroken, UsageError
-from simharness.play.planner import HttpPlanner
+from simharness.play.planner import REQUEST_TIMEOUT_S, HttpPlanner
 from simharness.play.records import Latency
 from simharness.sim.camera import Images, Observation
 
@@ -223,3 +223,8 @@ def model_document(name: str) -> dict[str, Any]:
         "limits": dict.fromkeys(limits, 10),
         "device": "cpu",
     }
+
+
+def test_a_service_that_does_not_answer_is_waited_for_as_long_as_the_harness_says() -> None:
+    with HttpPlanner("http://service.test", "tesnet", 1) as asked:
+        assert asked._client._timeout == REQUEST_TIMEOUT_S

@@ -97,3 +97,15 @@ def test_the_service_gets_fixed_settings(tmp_path: Path, monkeypatch: pytest.Mon
         LocalService("gpd", tmp_path / "log", command, weights=Path("/of/the/run.safetensors")),
     ):
         pass
+
+
+def test_a_service_of_the_harness_wants_no_key_whatever_this_machine_has_set(
+    tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setenv("GRASP_API_KEYS", "secret")
+    show = "import os; print('keys', os.environ.get('GRASP_API_KEYS')); raise SystemExit(1)"
+    with (
+        pytest.raises(RunBroken, match="keys None"),
+        LocalService("tesnet", tmp_path / "log", (sys.executable, "-c", show)),
+    ):
+        pass

@@ -7,6 +7,7 @@ from pathlib import Path
 
 import numpy as np
 
+from simharness.play.metrics import summarise
 from simharness.play.photographer import VIEWS, attempts_to_show, picture_name
 from simharness.play.pictures import (
     png,
@@ -76,3 +77,13 @@ def test_the_page_of_a_broken_run_says_so(run: Run, tmp_path: Path) -> None:
 def test_names_are_escaped_on_the_page(run: Run, tmp_path: Path) -> None:
     odd = dataclasses.replace(run, settings=dataclasses.replace(run.settings, objects="<script>alert(1)</script>"))
     assert "<script>" not in page(odd, report(odd, {}), [], tmp_path)
+
+
+def test_bars_of_rates_end_where_their_intervals_do(run: Run, tmp_path: Path) -> None:
+    html = page(run, report(run, {}), [], tmp_path)
+    drawn = [tuple(map(float, pair)) for pair in re.findall(r"left:([0-9.]+)%;width:([0-9.]+)%", html)]
+    summary = summarise(run.rounds)
+    for rate in (summary.gsr, summary.dr):
+        low, high = (100 * limit for limit in rate.interval)
+        assert any(abs(left - low) < 0.01 and abs(left + width - high) < 0.02 for left, width in drawn)
+    assert all(left + width <= 100.01 for left, width in drawn)

@@ -261,3 +261,26 @@ def test_objects_that_find_no_place_are_tried_twelve_times_or_twice_an_object(
         assert make_scene(world, "packed", [CUBE], np.random.default_rng(0), num_objects=wanted).placed == ()
         assert world.objects == ()
     assert len(tried) == tries
+
+
+def test_a_scene_that_is_put_back_weighs_and_grips_as_the_one_that_was_made(monkeypatch: pytest.MonkeyPatch) -> None:
+    told: list[tuple[float, float, float]] = []
+    load = World.load_object
+
+    def noted(world: World, path: Any, pose: Any, *, scale: float, mass: float, friction: float) -> int:
+        told.append((scale, mass, friction))
+        return load(world, path, pose, scale=scale, mass=mass, friction=friction)
+
+    monkeypatch.setattr(World, "load_object", noted)
+    with World() as world:
+        made = make_scene(
+            world, "packed", [CUBE], np.random.default_rng(3), variety=Variety(mass=(0.05, 0.2), friction=(0.5, 1.0))
+        )
+        first = set(told)
+        description = json.loads(json.dumps(describe(made)))
+    told.clear()
+    with World() as world:
+        restore_scene(world, description, {"cube": CUBE})
+    assert len(told) == len(made.placed) > 1
+    assert [(mass, friction) for _, mass, friction in told] == [(item.mass, item.friction) for item in made.placed]
+    assert set(told) <= first
