@@ -11,9 +11,9 @@ import torch
 from hypothesis import given, settings
 from hypothesis import strategies as st
 
-from tesnet import candidates, collision
+from tesnet import candidates, cloud, collision
 from tesnet.errors import InvalidQuery
-from tesnet.geometry import PANDA, Box, Gripper
+from tesnet.geometry import PANDA, Box, Gripper, Pose
 from tesnet.points import voxel_downsample
 from tests.tesnet.scenes import ask, fresh_predictor, prepared, tabletop, tabletop_query
 
@@ -161,3 +161,11 @@ def test_a_larger_palm_comes_nearer_to_the_support() -> None:
 def test_what_is_no_hand_or_opens_too_wide_is_refused(gripper: Any, words: str) -> None:
     with pytest.raises(InvalidQuery, match=f"gripper: .*{words}"):
         ask(np.zeros((4, 3)), gripper=gripper)
+
+
+def test_a_cell_with_as_many_target_points_as_others_is_on_the_target() -> None:
+    table = torch.tensor([[0.0, 0.0, 0.0, share] for share in (0.0, 0.49, 0.5, 0.51, 1.0)])
+    query = ask(np.zeros((5, 3)), target=np.ones(5, dtype=bool))
+    found = cloud._on_target(query, table, Pose.identity())
+    assert found is not None
+    assert found.tolist() == [False, False, True, True, True]

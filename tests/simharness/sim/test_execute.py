@@ -19,7 +19,7 @@ from simharness.sim.execute import (
     label_strict,
     snapshot_of,
 )
-from simharness.sim.hand import Hand, Placement
+from simharness.sim.hand import Hand, HandContact, Placement
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import TABLE_HEIGHT, restore_scene, settle
 from simharness.sim.world import BASE_LINK, World, data_path
@@ -327,3 +327,14 @@ def test_a_thing_is_still_where_it_neither_moves_nor_turns(moved: float, turned_
         shift = moved * direction / np.linalg.norm(direction)
         now = Pose(turn.rotation @ before.rotation, before.translation + shift)
         assert execute._still(before, now) == (moved < 0.0002 and turned_deg < 0.3)
+
+
+@pytest.mark.parametrize("touches", [(True, True), (True, False), (False, True), (False, False)])
+def test_of_a_contact_at_the_start_and_one_on_the_way_the_first_is_told(touches: tuple[bool, bool]) -> None:
+    start = HandContact("left finger", 1, (0.1, 0.1, 0.1), 0.001) if touches[0] else None
+    way = HandContact("right finger", 1, (0.1, 0.2, 0.1), 0.002) if touches[1] else None
+    with World() as world:
+        hand, _ = scene(world, MIDDLE)
+        outcome = execute._finish(world, hand, "slip", start, way)
+    assert (outcome.contact_at_start, outcome.contact_on_way) == touches
+    assert outcome.first_contact == (start if touches[0] else way)
