@@ -62,12 +62,17 @@ def of_answer(best: float, prepared: PreparedCloud, query: GraspQuery) -> list[s
     sight /= max(np.linalg.norm(sight), 1e-9)
     # Where nothing was found, what lies along the sight has not been seen, as of a box from straight above.
     measured = plausibility.extents(points) if best > 0 else plausibility.extents_across(points, sight)
-    return plausibility.answer_notes(best, span(spread(query.points, _SAMPLE)), measured, query.gripper.max_width)
+    return plausibility.answer_notes(best, _extent(query), measured, query.gripper.max_width)
+
+
+def _extent(query: GraspQuery) -> float:
+    """Of what was posted, from side to side, metres."""
+    return span(spread(query.points, _SAMPLE))
 
 
 def _of_posted(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
     """What the posted points suggest, whatever of them was left to look for grasps on."""
-    extent = span(spread(query.points, _SAMPLE))
+    extent = _extent(query)
     if len(prepared) < MINIMUM_POINTS:
         note = plausibility.crowded(len(query.points), len(prepared), extent, config.voxel_size)
         return [] if note is None else [note]
