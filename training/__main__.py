@@ -235,6 +235,7 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--start", type=Path, metavar="WEIGHTS", help="begin with these instead of random weights")
     parser.add_argument("--epochs", type=_positive, help="stop after so many, whatever the schedule")
     parser.add_argument("--threads", type=_positive, default=2)
+    parser.add_argument("--device", default="cpu", help="cpu, cuda or cuda:N")
     parser.add_argument("--seed", type=int, default=0)
     parser.add_argument("--version", default="0", help="version that the weights' header carries")
     parser.add_argument("--out", type=Path, required=True, help="weights file; its checkpoint lies beside it")
@@ -255,6 +256,7 @@ def _fit(options: argparse.Namespace) -> dict[str, object]:
         version=options.version,
         start=options.start,
         calibration=options.calibration,
+        device=options.device,
     )
 
 

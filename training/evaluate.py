@@ -13,7 +13,7 @@ from tesnet import networks, weights
 from tesnet.cloud import PreparationConfig
 from tesnet.networks import Network
 from training import metrics
-from training.views import LabelledView, LabelsError, load_views
+from training.views import LabelledView, LabelsError, load_views, moved
 
 WIDTH_BIN_MM = 20
 
@@ -101,12 +101,14 @@ def score_views(
 ) -> list[tuple[metrics.Logits, metrics.Success]]:
     """Logits and outcomes of every view's candidates that the observed cloud leaves free, or, if asked for, of all."""
     network.eval()
+    device = networks.device_of(network)
     scored = []
     for view in views:
         which = torch.arange(len(view.outcomes)) if blocked else view.collision_free.nonzero()[:, 0]
         if len(which):
-            logits = network.score(networks.encode(network, view.cloud), view.cloud, view.candidates.select(which))
-            scored.append((logits.double().numpy(), view.success[which].numpy()))
+            cloud, candidates = moved(view.cloud, device), moved(view.candidates.select(which), device)
+            logits = network.score(networks.encode(network, cloud), cloud, candidates)
+            scored.append((logits.cpu().double().numpy(), view.success[which].numpy()))
     return scored
 
 

@@ -15,17 +15,19 @@ import safetensors.torch
 import torch
 from torch import Tensor
 from torch.nn import functional
+from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from tesnet import networks, weights
 from tesnet.networks import Network
-from tesnet.predictor import configuration_of
+from tesnet.predictor import configuration_of, device_of
 from tesnet.threads import Threads
 from tesnet.whole_file import write_whole
 from training import metrics
 from training.augment import augment, vary
 from training.evaluate import validate
-from training.views import LabelledView, LabelsError, StoredViews, load_views, scene_files
+from training.processes import ALONE, Processes
+from training.views import LabelledView, LabelsError, StoredViews, load_views, moved, scene_files
 
 
 @dataclass(frozen=True, slots=True)
@@ -92,6 +94,9 @@ CPU core a step with all of them, 70 on average, would take several times as lon
 CHECKPOINT_S = 180.0
 """Seconds between checkpoints within an epoch."""
 
+READERS = 2
+"""Processes beside a GPU's own that read and turn the next views; the CPU has no core to spare for them."""
+
 
 @dataclass(slots=True)
 class _Progress:
@@ -132,6 +137,7 @@ def fit(
     version: str = "0",
     start: Path | None = None,
     calibration: Sequence[Path] = (),
+    device: str = "cpu",
 ) -> dict[str, Any]:
     """Trains network `name`, writes its weights to `out` and returns its validation measures.
 
@@ -140,6 +146,8 @@ def fit(
     share of successes among all labels are added to it (logit adjustment, arXiv 2007.07314). Which kind of candidate is
     shown more often does not bend it; which was labelled more often does. Checkpoints beside `out`, after every epoch
     and every few minutes within one, let a stopped run go on as if it had not been stopped.
+
+    Processes that torchrun started divide the views of each step among them; its gradient is the same.
 
     Args:
         name: of the network.
@@ -153,8 +161,10 @@ def fit(
         version: that the weights' header carries.
         start: weights to begin with, also older ones with fewer inputs; None for random ones.
         calibration: folders of labelled scenes that fit the calibration; those of `validation` unless given.
+        device: that computes: `cpu`, `cuda`, `cuda:1` ...
 
     Raises:
+        DeviceError: this machine does not have the device.
         LabelsError: folders without usable labels or with clouds of another preparation, a checkpoint of another recipe
             or seed, `start` of another network, or a network without parameters.
         WeightsError: `start` cannot be read.
@@ -162,7 +172,8 @@ def fit(
     torch.set_num_threads(threads)
     cores = Threads(threads)
     torch.manual_seed(seed)
-    network = _first_network(name, recipe, start)
+    processes = Processes.joined()
+    network = _first_network(name, recipe, start).to(device_of(device))
     if networks.is_weightless(name):
         raise LabelsError(f"{name} has no parameters to train; choose another network")
     train_views = StoredViews(data, network.preparation, metrics.usable)
@@ -184,11 +195,26 @@ def fit(
     # Only halving ends the training: along the cosine the rate is small at the start, too.
     while progress.epoch < last_epoch and (recipe.cosine or progress.learning_rate >= recipe.smallest_learning_rate):
         loss = _epoch(
-            network, optimiser, recipe, train_views, prior, progress, approach_points, checkpoint, cores=cores
+            network,
+            optimiser,
+            recipe,
+            train_views,
+            prior,
+            progress,
+            approach_points,
+            checkpoint,
+            cores=cores,
+            processes=processes,
         )
-        measures, of_all = validate(network, validation_views, seed, calibration_views)
-        _schedule(recipe, progress, measures["served_loss"])
-        if recipe.keep == "last" or measures["served_loss"] <= progress.best_loss:
+        measured = validate(network, validation_views, seed, calibration_views) if processes.leads else None
+        validation_loss = processes.from_leader(measured[0]["served_loss"] if measured else math.nan)
+        _schedule(recipe, progress, validation_loss)
+        is_kept = recipe.keep == "last" or validation_loss <= progress.best_loss
+        progress.best_loss = min(progress.best_loss, validation_loss)
+        if measured is None:
+            continue
+        measures, of_all = measured
+        if is_kept:
             training = {
                 "data": {"scenes": len(scene_files(data)), "views": len(train_views), "labels": labels, "prior": prior},
                 "recipe": asdict(recipe), "approach_points_per_step": approach_points, "seed": seed,
@@ -196,13 +222,13 @@ def fit(
             }  # fmt: skip
             header = weights.Header(name, version, configuration_of(network), tuple(measures["calibration"]), training)
             weights.save(out, network.state_dict(), header)
-        progress.best_loss = min(progress.best_loss, measures["served_loss"])
         # A run that is stopped between these two repeats the epoch's end and its line: an epoch's last line counts.
         with out.with_suffix(".log.jsonl").open("a") as log:
             log.write(json.dumps({"epoch": progress.epoch, "train_loss": loss, **measures, "with_blocked": of_all,
                                   "seconds": progress.seconds}) + "\n")  # fmt: skip
         progress.seconds = 0.0
         _save_checkpoint(checkpoint, network, optimiser, progress)
+    processes.meet()
     _, header = weights.load(out)
     return dict(header.training or {})
 
@@ -251,6 +277,7 @@ def _epoch(
     checkpoint: Path,
     *,
     cores: Threads,
+    processes: Processes = ALONE,
 ) -> float:
     """One pass over the views in a random order, from the step that was reached; the mean training loss.
 
@@ -258,36 +285,63 @@ def _epoch(
     """
     order = np.random.default_rng([progress.seed, progress.epoch]).permutation(len(views))
     steps = math.ceil(len(views) / recipe.views_per_step)
+    shares = [
+        order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step][processes.rank :: processes.count]
+        for step in range(progress.step, steps)
+    ]
+    device = networks.device_of(network)
+    drawn = DataLoader(
+        _Drawn(views, progress.seed, progress.epoch, vary=recipe.vary),
+        batch_size=None,
+        sampler=[int(index) for share in shares for index in share],
+        num_workers=0 if device.type == "cpu" else READERS,
+    )
+    coming = iter(drawn)
     log_odds = math.log(prior / (1 - prior))
     network.train()
-    bar = tqdm(range(progress.step, steps), desc=f"epoch {progress.epoch}", mininterval=10)
+    bar = tqdm(
+        shares, f"epoch {progress.epoch}", steps, mininterval=10, initial=progress.step, disable=not processes.leads
+    )
     seconds, started, saved = progress.seconds, time.monotonic(), time.monotonic()
-    for step in bar:
+    for share in bar:
         if recipe.cosine:
-            share = (progress.epoch + step / steps) / recipe.max_epochs
-            warm = min(1.0, (progress.epoch * steps + step + 1) / 100)
-            progress.learning_rate = warm * recipe.learning_rate * max(0.03, (1 + math.cos(math.pi * share)) / 2)
+            done = (progress.epoch + progress.step / steps) / recipe.max_epochs
+            warm = min(1.0, (progress.epoch * steps + progress.step + 1) / 100)
+            progress.learning_rate = warm * recipe.learning_rate * max(0.03, (1 + math.cos(math.pi * done)) / 2)
         for group in optimiser.param_groups:
             group["lr"] = progress.learning_rate
         optimiser.zero_grad()
-        for index in order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step]:
-            rng = np.random.default_rng([progress.seed, progress.epoch, int(index)])
-            view = vary(views[index], rng) if recipe.vary else views[index]
+        of_step = torch.zeros((), device=device)
+        for _ in share:
+            view, rng = next(coming)
             with cores.working():
-                loss = _view_loss(network, augment(view, rng), log_odds, recipe, rng, approach_points)
+                loss = _view_loss(network, view, log_odds, recipe, rng, approach_points)
                 (loss / recipe.views_per_step).backward()
-            progress.loss += float(loss.detach())
+            of_step += loss.detach()
+        progress.loss += processes.summed(list(network.parameters()), of_step)
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
-        progress.step = step + 1
+        progress.step += 1
         progress.seconds = seconds + time.monotonic() - started
         bar.set_postfix(loss=f"{progress.loss / (progress.step * recipe.views_per_step):.4f}")
-        if time.monotonic() - saved >= CHECKPOINT_S:
+        if processes.leads and time.monotonic() - saved >= CHECKPOINT_S:
             _save_checkpoint(checkpoint, network, optimiser, progress)
             saved = time.monotonic()
     mean = progress.loss / len(views)
     progress.epoch, progress.step, progress.loss = progress.epoch + 1, 0, 0.0
     return mean
+
+
+class _Drawn(Dataset[tuple[LabelledView, np.random.Generator]]):
+    """The views of an epoch as they are shown, each with the generator of what else is drawn for it."""
+
+    def __init__(self, views: StoredViews, seed: int, epoch: int, *, vary: bool) -> None:
+        self._views, self._seed, self._epoch, self._vary = views, seed, epoch, vary
+
+    def __getitem__(self, index: int) -> tuple[LabelledView, np.random.Generator]:
+        rng = np.random.default_rng([self._seed, self._epoch, index])
+        view = vary(self._views[index], rng) if self._vary else self._views[index]
+        return augment(view, rng), rng
 
 
 def _view_loss(
@@ -312,10 +366,12 @@ def _view_loss(
             _some(shown & ~view.collision_free, recipe.blocked_per_view, rng),
         ]
     )
-    target = view.success[which]
-    mirror = torch.from_numpy(rng.choice([-1.0, 1.0], len(which)).astype(np.float32))
-    logits = network.score(networks.encode(network, view.cloud), view.cloud, view.candidates.select(which), mirror)
-    return functional.binary_cross_entropy_with_logits(logits + log_odds, target.float())
+    device = networks.device_of(network)
+    target = view.success[which].float().to(device)
+    mirror = torch.from_numpy(rng.choice([-1.0, 1.0], len(which)).astype(np.float32)).to(device)
+    cloud, candidates = moved(view.cloud, device), moved(view.candidates.select(which), device)
+    logits = network.score(networks.encode(network, cloud), cloud, candidates, mirror)
+    return functional.binary_cross_entropy_with_logits(logits + log_odds, target)
 
 
 def _some(mask: Tensor, count: int, rng: np.random.Generator) -> Tensor:

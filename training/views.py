@@ -5,9 +5,9 @@ from __future__ import annotations
 import json
 import zipfile
 from collections.abc import Callable, Iterable, Iterator, Mapping, Sequence
-from dataclasses import asdict, dataclass, replace
+from dataclasses import asdict, dataclass, fields, replace
 from pathlib import Path
-from typing import Any
+from typing import Any, TypeVar
 
 import numpy as np
 import torch
@@ -77,6 +77,18 @@ class LabelledView:
     def success(self) -> torch.Tensor:
         """(C,) bool."""
         return self.outcomes == OUTCOME_KINDS.index("success")
+
+
+_OfTensors = TypeVar("_OfTensors", PreparedCloud, Candidates)
+
+
+def moved(what: _OfTensors, device: torch.device) -> _OfTensors:
+    """The cloud or candidates with their tensors on a device."""
+    values: dict[str, Any] = {field.name: getattr(what, field.name) for field in fields(what)}
+    tensors: dict[str, Any] = {
+        name: value.to(device) for name, value in values.items() if isinstance(value, torch.Tensor)
+    }
+    return replace(what, **tensors)
 
 
 def count_outcomes(outcomes: Iterable[NDArray[np.uint8]]) -> NDArray[np.int64]:

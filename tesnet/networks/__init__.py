@@ -9,6 +9,8 @@ from collections.abc import Mapping
 from pathlib import Path
 from typing import Any
 
+import torch
+
 from tesnet import weights
 from tesnet.errors import WeightsError
 from tesnet.networks.edgegrasp import EdgeGrasp, EdgeGraspConfig
@@ -20,7 +22,7 @@ from tesnet.networks.pointnetgpd import PointNetGPD, PointNetGPDConfig
 from tesnet.networks.tesnet import TesNet, TesNetConfig
 from tesnet.networks.tesnet_paper import TesNetEuclideanConfig, TesNetPaper, TesNetPaperConfig
 
-__all__ = ["NETWORKS", "Network", "build", "encode", "is_weightless", "load"]
+__all__ = ["NETWORKS", "Network", "build", "device_of", "encode", "is_weightless", "load"]
 
 NETWORKS: Mapping[str, tuple[type[Network], type[Any]]] = {
     "tesnet": (TesNet, TesNetConfig),
@@ -65,6 +67,11 @@ def is_weightless(name: str) -> bool:
         ValueError: an unknown name; the message lists the valid ones.
     """
     return not list(build(name).parameters())
+
+
+def device_of(network: Network) -> torch.device:
+    """Where a network's parameters are; the CPU for one without."""
+    return next(network.parameters(), torch.empty(0)).device
 
 
 def load(path: Path) -> tuple[Network, weights.Header]:

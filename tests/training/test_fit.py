@@ -341,7 +341,7 @@ def test_a_step_may_show_the_candidates_of_few_approach_points() -> None:
         shown.append(candidates.approach)
         return torch.zeros(len(candidates))
 
-    network = SimpleNamespace(encode_batch=lambda clouds: [None], score=score)
+    network = SimpleNamespace(encode_batch=lambda clouds: [None], score=score, parameters=lambda: iter(()))
     for limit in (3, None):
         fitting._view_loss(network, view, 0.0, RECIPE, np.random.default_rng(0), limit)  # type: ignore[arg-type]
     few, many = shown
@@ -373,6 +373,7 @@ def test_a_logit_of_zero_is_an_even_chance_at_a_balanced_prior(shown: float) -> 
     network = SimpleNamespace(
         encode_batch=lambda clouds: [None],
         score=lambda features, cloud, candidates, mirror: logit.expand(len(candidates)),
+        parameters=lambda: iter(()),
     )
     log_odds = math.log(shown / (1 - shown))
     recipe = replace(RECIPE, candidates_per_view=60)
