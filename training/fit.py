@@ -15,7 +15,6 @@ import safetensors.torch
 import torch
 from torch import Tensor
 from torch.nn import functional
-from torch.utils.data import DataLoader, Dataset
 from tqdm import tqdm
 
 from tesnet import networks, weights
@@ -93,9 +92,6 @@ CPU core a step with all of them, 70 on average, would take several times as lon
 
 CHECKPOINT_S = 180.0
 """Seconds between checkpoints within an epoch."""
-
-READERS = 2
-"""Processes beside a GPU's own that read and turn the next views; the CPU has no core to spare for them."""
 
 
 @dataclass(slots=True)
@@ -285,43 +281,31 @@ def _epoch(
     """
     order = np.random.default_rng([progress.seed, progress.epoch]).permutation(len(views))
     steps = math.ceil(len(views) / recipe.views_per_step)
-    shares = [
-        order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step][processes.rank :: processes.count]
-        for step in range(progress.step, steps)
-    ]
-    device = networks.device_of(network)
-    drawn = DataLoader(
-        _Drawn(views, progress.seed, progress.epoch, vary=recipe.vary),
-        batch_size=None,
-        sampler=[int(index) for share in shares for index in share],
-        num_workers=0 if device.type == "cpu" else READERS,
-    )
-    coming = iter(drawn)
     log_odds = math.log(prior / (1 - prior))
     network.train()
-    bar = tqdm(
-        shares, f"epoch {progress.epoch}", steps, mininterval=10, initial=progress.step, disable=not processes.leads
-    )
+    bar = tqdm(range(progress.step, steps), f"epoch {progress.epoch}", mininterval=10, disable=not processes.leads)
     seconds, started, saved = progress.seconds, time.monotonic(), time.monotonic()
-    for share in bar:
+    for step in bar:
         if recipe.cosine:
-            done = (progress.epoch + progress.step / steps) / recipe.max_epochs
-            warm = min(1.0, (progress.epoch * steps + progress.step + 1) / 100)
-            progress.learning_rate = warm * recipe.learning_rate * max(0.03, (1 + math.cos(math.pi * done)) / 2)
+            share = (progress.epoch + step / steps) / recipe.max_epochs
+            warm = min(1.0, (progress.epoch * steps + step + 1) / 100)
+            progress.learning_rate = warm * recipe.learning_rate * max(0.03, (1 + math.cos(math.pi * share)) / 2)
         for group in optimiser.param_groups:
             group["lr"] = progress.learning_rate
         optimiser.zero_grad()
-        of_step = torch.zeros((), device=device)
-        for _ in share:
-            view, rng = next(coming)
+        of_step = torch.zeros((), device=networks.device_of(network))
+        shown = order[step * recipe.views_per_step : (step + 1) * recipe.views_per_step]
+        for index in shown[processes.rank :: processes.count]:
+            rng = np.random.default_rng([progress.seed, progress.epoch, int(index)])
+            view = vary(views[index], rng) if recipe.vary else views[index]
             with cores.working():
-                loss = _view_loss(network, view, log_odds, recipe, rng, approach_points)
+                loss = _view_loss(network, augment(view, rng), log_odds, recipe, rng, approach_points)
                 (loss / recipe.views_per_step).backward()
             of_step += loss.detach()
         progress.loss += processes.summed(list(network.parameters()), of_step)
         torch.nn.utils.clip_grad_norm_(network.parameters(), 1.0)
         optimiser.step()
-        progress.step += 1
+        progress.step = step + 1
         progress.seconds = seconds + time.monotonic() - started
         bar.set_postfix(loss=f"{progress.loss / (progress.step * recipe.views_per_step):.4f}")
         if processes.leads and time.monotonic() - saved >= CHECKPOINT_S:
@@ -330,18 +314,6 @@ def _epoch(
     mean = progress.loss / len(views)
     progress.epoch, progress.step, progress.loss = progress.epoch + 1, 0, 0.0
     return mean
-
-
-class _Drawn(Dataset[tuple[LabelledView, np.random.Generator]]):
-    """The views of an epoch as they are shown, each with the generator of what else is drawn for it."""
-
-    def __init__(self, views: StoredViews, seed: int, epoch: int, *, vary: bool) -> None:
-        self._views, self._seed, self._epoch, self._vary = views, seed, epoch, vary
-
-    def __getitem__(self, index: int) -> tuple[LabelledView, np.random.Generator]:
-        rng = np.random.default_rng([self._seed, self._epoch, index])
-        view = vary(self._views[index], rng) if self._vary else self._views[index]
-        return augment(view, rng), rng
 
 
 def _view_loss(
