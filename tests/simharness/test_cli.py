@@ -133,6 +133,20 @@ def test_a_service_that_nobody_runs_exits_3(tmp_path: Path, capsys: pytest.Captu
     assert json.loads((tmp_path / "report.json").read_text())["complete"] is False
 
 
+def test_camera_giga_plays_the_rounds_again_with_the_published_crop(start_stub: Any, tmp_path: Path) -> None:
+    giga = ("--camera", "giga", "--rounds", 1, "--workers", 1, "--url")
+    done = run_it(*giga, start_stub("--nothing"), "--out", tmp_path / "whole")
+    assert done.returncode == 0, done.stderr
+    of_both = [tmp_path / "whole" / name / "report.json" for name in ("", "published-crop")]
+    assert [json.loads(path.read_text())["settings"]["calibrate"] for path in of_both] == [True, False]
+    assert done.stdout.count("published-crop:") == 1
+
+    broken = run_it(*giga, "http://127.0.0.1:9", "--out", tmp_path / "broken")
+    assert broken.returncode == 3
+    assert "published-crop" not in broken.stdout
+    assert not (tmp_path / "broken" / "published-crop").exists()
+
+
 def test_weights_that_are_missing_are_named(
     tmp_path: Path, monkeypatch: pytest.MonkeyPatch, capsys: pytest.CaptureFixture[str]
 ) -> None:
