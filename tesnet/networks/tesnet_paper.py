@@ -16,8 +16,8 @@ however far apart they lie. `tesnet-euclidean` is the same network with neighbou
 ones (equations 10 to 12). Both kinds of neighbours turn with the points.
 
 Left open by the paper and chosen here: three stages, their widths, and layer normalisation; a ball's origin, which is
-its approach point (equation 9's centroid serves for the directions above and, in training, for the whole cloud); that balls
-are thinned, and the geometry of a pair (`balls`, `pairs`).
+its approach point (equation 9's centroid serves for the directions above and, in training, for the whole cloud); that
+balls are thinned, and the geometry of a pair (`balls`, `pairs`).
 """
 
 from __future__ import annotations
