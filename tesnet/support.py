@@ -27,8 +27,8 @@ MOST_SEEN_THROUGH = 0.15
 """Of a plane's own points: so many others may be seen through it; more, and it is a slice of the air."""
 SMALL_AREA = 0.09
 MOST_UNDER = 0.2
-"""Under the top of a box are its sides. For a plane under `SMALL_AREA` square metres: points straight below it, as a
-share of its own."""
+"""Under the top of a box are its sides. For a plane under `SMALL_AREA` square metres: points straight below it, down to
+`TALLEST`, as a share of its own."""
 LEAST_AREA, LEAST_WORTH = 0.008, 0.1
 """What is smaller is no support, and under `SMALL_AREA` what less speaks for than such a part of the most."""
 LARGE_SHARE = 0.2
@@ -243,7 +243,8 @@ def _is_surface(plane: Plane, area: float, points: Array, eye: Array | None) -> 
     height, own = points @ plane.up - plane.height, int(plane.own.sum())
     if area < LEAST_AREA:
         return False
-    if area < SMALL_AREA and (within(points, plane.sides) & (height < -BELOW)).sum() > MOST_UNDER * own:
+    under = (height < -BELOW) & (height > -TALLEST)
+    if area < SMALL_AREA and (within(points, plane.sides) & under).sum() > MOST_UNDER * own:
         return False
     return eye is None or _seen_through(plane, points, height, eye) <= MOST_SEEN_THROUGH * own
 

@@ -11,7 +11,7 @@ import pytest
 from numpy.typing import NDArray
 
 from bench import rooms
-from bench.solids import Block, Placed, standing
+from bench.solids import Block, Cylinder, Placed, standing
 from tesnet import support
 from tesnet.cloud import SUPPORT_NOISE
 from tesnet.depth_noise import DepthNoise
@@ -188,7 +188,7 @@ def by_a_loop(plane: Plane, noise: float, points: Array, eye: Any) -> tuple[bool
     squares = [tuple(square) for square in np.floor(uv / SQUARE).astype(int).tolist()]
     area = len({square for square, is_own in zip(squares, plane.own, strict=True) if is_own}) * SQUARE**2
     inside = [all(point @ side[:3] <= side[3] for side in plane.sides) for point in points]
-    below = sum(one and h < -0.015 for one, h in zip(inside, heights, strict=True))
+    below = sum(one and -0.35 < h < -0.015 for one, h in zip(inside, heights, strict=True))
     is_surface = not (area < 0.008 or (area < 0.09 and below > 0.2 * plane.own.sum()))
     if eye is not None:
         over, through = eye @ plane.up - plane.height, 0
@@ -265,6 +265,18 @@ def test_what_is_below_the_edge_of_a_nearer_plane_is_no_thing_on_the_floor(
     rng = np.random.default_rng(1)
     room = {"legs": rooms.small_table, "cabinet": rooms.cabinet, "stairs": rooms.stairs}[kind](rng)
     assert_support_is_the_truth(rooms.photograph(room, rooms.VGA, 0.001, rng, focal_share), up)
+
+
+@pytest.mark.parametrize("up", ["auto", "given"])
+@pytest.mark.parametrize("radius", [0.14, 0.16])
+def test_the_seat_of_a_stool_is_a_support_though_the_floor_shows_below_it(radius: float, up: str) -> None:
+    """Under the top of a box are its sides; the floor is too far below to be one."""
+    seat, column = Cylinder(radius, 0.015), Cylinder(0.03, 0.21)
+    stool = [(seat, standing(0, 0, 0.435)), (column, standing(0, 0, 0.21))]
+    things = [thing(-0.05, 0.02, 0.05, 0.45), thing(0.06, -0.03, 0.04, 0.45)]
+    eye, corners = np.array([0, -0.55, 0.95]), rooms._corners(2 * radius, 2 * radius)
+    room = rooms.Room((rooms._floor(), *stool, *things), eye, np.array([0, 0, 0.45]), 0.45, corners)
+    assert_support_is_the_truth(rooms.photograph(room, rooms.VGA, 0.001, np.random.default_rng(0)), up)
 
 
 def assert_support_is_the_truth(frame: rooms.RoomFrame, up: str) -> None:
