@@ -57,7 +57,7 @@ UNPACK = {
 }  # fmt: skip
 FIT = {
     "model": "gpd", "data": ("one", "two"), "validation": ("three", "four"), "calibration": ("five", "six"),
-    "preset": "paper", "start": "w.safetensors", "epochs": 3, "threads": 5, "seed": 9, "version": "1.2",
+    "preset": "paper", "start": "w.safetensors", "epochs": 3, "threads": 5, "device": "cuda:1", "seed": 9, "version": "1.2",
     "out": "o/new.w", "objects": "procedural,ycb", "more_views": 2, "camera": "top", "sensor": "d415",
 }  # fmt: skip
 EVALUATE = {"model": "gpd", "weights": "w.safetensors", "data": ("one", "two"), "seed": 4}
@@ -141,7 +141,7 @@ def test_what_is_trained_is_what_the_options_say(
         {
             "name": "gpd", "data": [Path("one"), rendered if is_archive else Path("two")],
             "validation": paths(["three", "four"]), "calibration": paths(["five", "six"]), "recipe": PRESETS["paper"],
-            "out": Path("o/new.w"), "epochs": 3, "threads": 5, "seed": 9, "version": "1.2",
+            "out": Path("o/new.w"), "epochs": 3, "threads": 5, "device": "cuda:1", "seed": 9, "version": "1.2",
             "start": Path("w.safetensors"),
         }
     ]  # fmt: skip
