@@ -58,7 +58,8 @@ UNPACK = {
 FIT = {
     "model": "gpd", "data": ("one", "two"), "validation": ("three", "four"), "calibration": ("five", "six"),
     "preset": "paper", "start": "w.safetensors", "epochs": 3, "threads": 5, "seed": 9, "version": "1.2",
-    "device": "cuda:1", "out": "o/new.w", "objects": "procedural,ycb", "more_views": 2, "camera": "top", "sensor": "d415",
+    "out": "o/new.w", "objects": "procedural,ycb", "more_views": 2, "camera": "top", "sensor": "d415",
+    "device": "cuda:1",
 }  # fmt: skip
 EVALUATE = {"model": "gpd", "weights": "w.safetensors", "data": ("one", "two"), "seed": 4}
 COMPARE = {"data": "runs", "out": "tables", "validation": ("one", "two")}
