@@ -105,7 +105,7 @@ class GraspPredictor:
             WeightsError: the file is missing, corrupted or does not fit its network.
             DeviceError: this machine does not have the device.
         """
-        chosen = device_of(device)
+        chosen = named_device(device)
         network, header = networks.load(path)
         try:
             sections = {name: dict(header.configuration[name]) for name in ("network", "preparation", "candidates")}
@@ -125,7 +125,7 @@ class GraspPredictor:
         """
         if not networks.is_weightless(name):
             raise ValueError(f"network {name!r} has weights; load them from a file")
-        chosen = device_of(device)
+        chosen = named_device(device)
         network = networks.build(name).eval()
         sections = configuration_of(network)
         model = ModelInfo(name, "1", None, {}, sections)
@@ -429,7 +429,7 @@ def configuration_of(network: Network) -> dict[str, dict[str, Any]]:
     }
 
 
-def device_of(name: str) -> torch.device:
+def named_device(name: str) -> torch.device:
     """The device that `auto`, `cpu`, `cuda` or `cuda:N` names; raises DeviceError where this machine lacks it."""
     if name == "auto":
         return torch.device("cuda" if torch.cuda.is_available() else "cpu")

@@ -19,7 +19,7 @@ from tqdm import tqdm
 
 from tesnet import networks, weights
 from tesnet.networks import Network
-from tesnet.predictor import configuration_of, device_of
+from tesnet.predictor import configuration_of, named_device
 from tesnet.threads import Threads
 from tesnet.whole_file import write_whole
 from training import metrics
@@ -169,7 +169,7 @@ def fit(
     cores = Threads(threads)
     torch.manual_seed(seed)
     processes = Processes.joined()
-    network = _first_network(name, recipe, start).to(device_of(device))
+    network = _first_network(name, recipe, start).to(named_device(device))
     if networks.is_weightless(name):
         raise LabelsError(f"{name} has no parameters to train; choose another network")
     train_views = StoredViews(data, network.preparation, metrics.usable)
