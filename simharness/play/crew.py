@@ -14,6 +14,7 @@ from collections import deque
 from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import AbstractContextManager, ExitStack, contextmanager
 from dataclasses import dataclass
+from multiprocessing import resource_tracker
 from multiprocessing.connection import Connection, wait
 from multiprocessing.process import BaseProcess
 from typing import TYPE_CHECKING, Any, Generic, Protocol, TypeVar
@@ -176,11 +177,25 @@ def _one_thread_each() -> Iterator[None]:
 
 
 @contextmanager
+def _deaf_to_ctrl_c() -> Iterator[None]:
+    """Processes that are started inside inherit a blocked SIGINT: Ctrl-C does not end one that still imports modules.
+
+    Our own waits meanwhile.
+    """
+    resource_tracker.ensure_running()  # it unblocks the signal when it starts, which the first process would have it do
+    before = signal.pthread_sigmask(signal.SIG_BLOCK, {signal.SIGINT})
+    try:
+        yield
+    finally:
+        signal.pthread_sigmask(signal.SIG_SETMASK, before)
+
+
+@contextmanager
 def _processes(task: Task[Job], count: int) -> Iterator[_Processes[Job]]:
     context = multiprocessing.get_context("spawn")
     workers: list[_Process[Job]] = []
     try:
-        with _one_thread_each():
+        with _one_thread_each(), _deaf_to_ctrl_c():
             for number in range(count):
                 ours, theirs = context.Pipe()
                 process = context.Process(target=_live, args=(theirs, task), name=f"worker-{number}", daemon=True)
@@ -205,6 +220,7 @@ def _live(connection: Connection, task: Task[Any]) -> None:
     """A worker's life: jobs until the other end of the pipe is closed, by its owner or by its owner's death."""
     # Ctrl-C reaches every process of the terminal; the parent decides what it means.
     signal.signal(signal.SIGINT, signal.SIG_IGN)
+    signal.pthread_sigmask(signal.SIG_UNBLOCK, {signal.SIGINT})
     try:
         try:
             with task.begin() as work:

@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+import multiprocessing
 import os
 import signal
 from collections.abc import Iterator
@@ -64,6 +65,18 @@ def test_every_job_is_done_and_what_it_emits_is_heard() -> None:
         assert workers.hear(0) == []
         workers.give(7)
         assert hear(workers, 1)[0] == {7: 50}
+
+
+def test_ctrl_c_does_not_end_a_worker_that_still_imports() -> None:
+    with crew(Squares(), 2, None) as workers:
+        young = multiprocessing.active_children()
+        for _ in range(3):
+            for process in young:
+                os.kill(process.pid or 0, signal.SIGINT)
+        for job in (2, 3):
+            workers.give(job)
+        assert hear(workers, 2)[0] == {2: 4, 3: 9}
+    assert signal.SIGINT not in signal.pthread_sigmask(signal.SIG_BLOCK, ())
 
 
 @pytest.mark.parametrize(
