@@ -53,6 +53,8 @@ class TesNetConfig:
         caution: log odds that a candidate would lose whose fingers stood wholly in what no camera saw; it loses the
             part of them that stands there. Not in training: on things that fit into a hand, behind what is seen there
             is nothing, and so a network learns; on things wider than the hand there is.
+        mirrored: of so many candidates of a call, the best, the logit is the mean of what the network makes of their
+            surroundings and of these reflected in the hand's plane. Not in training, which shows either.
     """
 
     channels: int = 32
@@ -70,6 +72,7 @@ class TesNetConfig:
     around_region: Region = (0.035, 0.085, 0.060, 0.045)
     told: bool = False
     caution: float = 0.0
+    mirrored: int = 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -168,11 +171,23 @@ class TesNet(nn.Module):
                 outcome of a grasp does not change. For training.
         """
         candidates = at_rest(cloud, candidates)
-        poses = candidates.Ts_canonical_grasp
-        sign = torch.ones(len(poses), device=poses.device) if mirror is None else mirror
         at_fingers = self.closing.members(cloud.points, candidates)
         near_hand = self.around.members(features.patches.points, candidates)
-        of_closing, of_around, of_head = self.told(cloud, candidates, at_fingers) if self.config.told else (None,) * 3
+        told = self.told(cloud, candidates, at_fingers) if self.config.told else None
+        seen = _Seen(candidates, at_fingers, near_hand, told)
+        one = torch.ones(len(candidates), device=cloud.points.device)
+        logits = self._logits(features, cloud, seen, one if mirror is None else mirror)
+        if self.config.mirrored and mirror is None and not self.training:
+            best = logits.topk(min(self.config.mirrored, len(logits))).indices
+            reflected = self._logits(features, cloud, seen.select(best), -one[best])
+            logits = logits.index_copy(0, best, (logits[best] + reflected) / 2)
+        return logits
+
+    def _logits(self, features: CloudFeatures, cloud: PreparedCloud, seen: _Seen, sign: Tensor) -> Tensor:
+        """Logits (C,) of candidates whose surroundings are mirrored where `sign` (C,) is -1."""
+        candidates, at_fingers, near_hand = seen.candidates, seen.at_fingers, seen.near_hand
+        poses = candidates.Ts_canonical_grasp
+        of_closing, of_around, of_head = seen.told or (None,) * 3
         closing = self.closing(features.points, cloud, at_fingers, poses, sign, of_closing)
         around = self.around(features.wide, features.patches, near_hand, poses, sign, of_around)
         totals = torch.stack([at_fingers.total, near_hand.total], dim=1)
@@ -226,6 +241,31 @@ class RegionMembers:
 
     index: Tensor
     total: Tensor
+
+    def select(self, rows: Tensor) -> RegionMembers:
+        """Those of some candidates."""
+        return RegionMembers(self.index[rows], self.total[rows])
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class _Seen:
+    """Candidates and what is looked at for them, mirrored or not.
+
+    Args:
+        candidates: where their fingers come to rest.
+        at_fingers, near_hand: points and patches in their regions.
+        told: what `Told` makes of them, if the network is told.
+    """
+
+    candidates: Candidates
+    at_fingers: RegionMembers
+    near_hand: RegionMembers
+    told: Sequence[Tensor] | None
+
+    def select(self, rows: Tensor) -> _Seen:
+        """The same of some candidates."""
+        told = None if self.told is None else [part[rows] for part in self.told]
+        return _Seen(self.candidates.select(rows), self.at_fingers.select(rows), self.near_hand.select(rows), told)
 
 
 class RegionPooling(nn.Module):

@@ -219,6 +219,25 @@ def test_caution_takes_log_odds_by_the_part_of_the_fingers_that_no_camera_saw_bu
     torch.testing.assert_close(careful.train().score(features(), ready, found), score(found), atol=1e-5, rtol=0)
 
 
+@pytest.mark.parametrize("network", [fresh_network, told_network])
+def test_the_best_candidates_are_scored_in_both_mirrored_forms_but_not_in_training(network: Any) -> None:
+    ready, found = example()
+    both = TesNet(replace(network().config, mirrored=20))
+    both.load_state_dict(network().state_dict())
+    one = torch.ones(len(found))
+    with torch.inference_mode():
+        seen = network().encode_batch([ready])[0]
+        plain, reflected = (network().score(seen, ready, found, sign * one) for sign in (1, -1))
+        expected = plain.clone()
+        best = plain.argsort(descending=True)[:20]
+        expected[best] = (plain + reflected)[best] / 2
+        torch.testing.assert_close(both.eval().score(seen, ready, found), expected, atol=1e-5, rtol=0)
+        torch.testing.assert_close(both.eval().score(seen, ready, found, -one), reflected, atol=1e-5, rtol=0)
+        few = found.select(best[:3])
+        torch.testing.assert_close(both.score(seen, ready, few), expected[best[:3]], atol=1e-5, rtol=0)
+        torch.testing.assert_close(both.train().score(seen, ready, found), plain, atol=1e-5, rtol=0)
+
+
 def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
     ready, found = example()
     network = fresh_network()
