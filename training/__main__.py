@@ -1,4 +1,4 @@
-"""`python -m training generate|pack|unpack|fit|evaluate|compare`: labels, weights and their measures."""
+"""`python -m training generate|pack|unpack|fit|mean|evaluate|compare`: labels, weights and their measures."""
 
 from __future__ import annotations
 
@@ -22,6 +22,7 @@ from training.evaluate import evaluate
 from training.fit import PRESETS as RECIPES
 from training.fit import fit
 from training.generate import GenerateConfig, generate
+from training.mean import mean
 from training.viewing import MoreViews
 from training.views import LabelsError
 
@@ -45,6 +46,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_pack(commands.add_parser("pack", help="put stored labels into a small archive"))
     _add_unpack(commands.add_parser("unpack", help="render the clouds of an archive again"))
     _add_fit(commands.add_parser("fit", help="train a network on stored labels"))
+    _add_mean(commands.add_parser("mean", help="average weights that were trained one from another"))
     _add_evaluate(commands.add_parser("evaluate", help="measure a network on stored labels"))
     _add_compare(commands.add_parser("compare", help="put trained networks side by side: table and figure"))
     return parser
@@ -268,6 +270,26 @@ def _rendered(archive: Path, options: argparse.Namespace) -> Path:
     preparation = _preparation_of(options.model)
     unpack(archive, options.objects, folder, options.threads, _more_views(options), preparation=preparation)
     return folder
+
+
+def _add_mean(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--weights", type=Path, nargs="+", required=True, help="files of one network")
+    parser.add_argument(
+        "--validation", type=Path, nargs="+", required=True, help="folders of labelled validation scenes"
+    )
+    parser.add_argument("--preset", choices=sorted(RECIPES), help="whose settings of the network it gets")
+    parser.add_argument("--seed", type=int, default=0)
+    parser.add_argument("--version", default="0", help="version that the weights' header carries")
+    parser.add_argument("--out", type=Path, required=True)
+    parser.set_defaults(run=_mean)
+
+
+def _mean(options: argparse.Namespace) -> dict[str, object]:
+    settings = RECIPES[options.preset].network if options.preset else {}
+    return mean(
+        options.weights, options.validation, options.out,
+        settings=settings, seed=options.seed, version=options.version,
+    )  # fmt: skip
 
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:

@@ -40,7 +40,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> dict[str, Told]:
 
         return noted
 
-    for name in ("generate", "pack", "unpack", "fit", "evaluate", "compare"):
+    for name in ("generate", "pack", "unpack", "fit", "mean", "evaluate", "compare"):
         monkeypatch.setattr(command, name, noting(getattr(command, name), calls.setdefault(name, [])))
     return calls
 
@@ -62,10 +62,15 @@ FIT = {
     "device": "cuda:1",
 }  # fmt: skip
 EVALUATE = {"model": "gpd", "weights": "w.safetensors", "data": ("one", "two"), "seed": 4}
+MEAN = {
+    "weights": ("a.w", "b.w"), "validation": ("one", "two"), "preset": "product", "seed": 8, "version": "1.3",
+    "out": "o/mean.w",
+}  # fmt: skip
 COMPARE = {"data": "runs", "out": "tables", "validation": ("one", "two")}
 PACK = {"data": ("one", "two"), "out": "archive"}
 EVERY_OPTION: dict[str, dict[str, Any]] = {
-    "generate": GENERATE, "pack": PACK, "unpack": UNPACK, "fit": FIT, "evaluate": EVALUATE, "compare": COMPARE,
+    "generate": GENERATE, "pack": PACK, "unpack": UNPACK, "fit": FIT, "mean": MEAN, "evaluate": EVALUATE,
+    "compare": COMPARE,
 }  # fmt: skip
 
 
@@ -112,8 +117,8 @@ def test_what_is_generated_is_what_the_options_say(told: dict[str, Told], capsys
     assert told["generate"][2]["config"] == GenerateConfig("pile", "procedural,ycb")
 
 
-def test_what_is_packed_rendered_measured_and_compared_is_what_the_options_say(told: dict[str, Told]) -> None:
-    for name in ("pack", "unpack", "evaluate", "compare"):
+def test_what_is_packed_rendered_averaged_measured_and_compared_is_what_the_options_say(told: dict[str, Told]) -> None:
+    for name in ("pack", "unpack", "mean", "evaluate", "compare"):
         assert main([name, *words(EVERY_OPTION[name])]) == 0
     assert told["pack"] == [{"folders": paths(["one", "two"]), "out": Path("archive")}]
     assert told["unpack"] == [
@@ -123,6 +128,15 @@ def test_what_is_packed_rendered_measured_and_compared_is_what_the_options_say(t
             "preparation": networks.NETWORKS["gpd"][0].preparation,
         }
     ]  # fmt: skip
+    assert told["mean"] == [
+        {
+            "files": paths(["a.w", "b.w"]), "validation": paths(["one", "two"]), "out": Path("o/mean.w"), "seed": 8,
+            "version": "1.3", "settings": PRESETS["product"].network,
+        }
+    ]  # fmt: skip
+    needed = {name: MEAN[name] for name in ("weights", "validation", "out")}
+    assert main(["mean", *words(needed)]) == 0
+    assert told["mean"][1]["settings"] == {}
     (evaluated,) = told["evaluate"]
     assert evaluated == {
         "name": "gpd", "path": Path("w.safetensors"), "data": paths(["one", "two"]), "seed": 4,

@@ -1,0 +1,66 @@
+"""The mean of several weights of one network, where each was trained from the one before it.
+
+Such a mean is often better than each on what they were trained on in turn (Wortsman et al. 2022, arXiv 2109.01903).
+"""
+
+from __future__ import annotations
+
+from collections.abc import Mapping, Sequence
+from pathlib import Path
+from types import MappingProxyType
+from typing import Any
+
+import torch
+
+from tesnet import networks, weights
+from tesnet.predictor import configuration_of
+from training.evaluate import validate
+from training.views import LabelsError, load_views
+
+
+def mean(
+    files: Sequence[Path],
+    validation: Sequence[Path],
+    out: Path,
+    *,
+    settings: Mapping[str, Any] = MappingProxyType({}),
+    seed: int = 0,
+    version: str = "0",
+) -> dict[str, Any]:
+    """Writes the mean of the weights in `files` to `out` and returns its validation measures.
+
+    Args:
+        files: of one network with one configuration.
+        validation: folders of labelled scenes, which fit the calibration, too.
+        out: the weights file.
+        settings: fields of the network's configuration that are to differ from that of the files.
+        seed: of the measures' subsampling.
+        version: that the weights' header carries.
+
+    Raises:
+        LabelsError: files of different networks, or folders without labels.
+        WeightsError: a file cannot be read.
+    """
+    loaded = [networks.load(path) for path in files]
+    _, first = loaded[0]
+    for path, (_, header) in zip(files, loaded, strict=True):
+        if (header.network, header.configuration["network"]) != (first.network, first.configuration["network"]):
+            raise LabelsError(f"{path} holds another network than {files[0]}; give weights of one network")
+    states = [one.state_dict() for one, _ in loaded]
+    network = networks.build(first.network, {**first.configuration["network"], **settings})
+    network.load_state_dict({name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]})
+    measures, of_all = validate(network, list(load_views(validation, network.preparation)), seed)
+    training = {
+        "mean_of": [
+            {"sha256": weights.sha256(path), "training": header.training}
+            for path, (_, header) in zip(files, loaded, strict=True)
+        ],
+        "validation": measures,
+        "validation_with_blocked": of_all,
+    }
+    weights.save(
+        out,
+        network.state_dict(),
+        weights.Header(first.network, version, configuration_of(network), tuple(measures["calibration"]), training),
+    )
+    return training
