@@ -58,6 +58,8 @@ def of_support(query: GraspQuery) -> list[str]:
 
 def of_answer(best: float, prepared: PreparedCloud, query: GraspQuery) -> list[str]:
     """Whether the scores are so low that the scale may be wrong."""
+    if best >= plausibility.LOW_SCORE:
+        return []
     points, sight = prepared.points.cpu().numpy(), prepared.view_directions.double().mean(dim=0).cpu().numpy()
     sight /= max(np.linalg.norm(sight), 1e-9)
     # Where nothing was found, what lies along the sight has not been seen, as of a box from straight above.

@@ -227,8 +227,6 @@ def answer_notes(best: float, extent: float, extents: NDArray[np.float64], max_w
         extents: (E,) of what grasps were looked for on, metres.
         max_width: of the hand.
     """
-    if best >= LOW_SCORE:
-        return []
     notes = [low_scores(best, extent), too_wide(best, extents, max_width)]
     return [note for note in notes if note is not None]
 

@@ -151,10 +151,11 @@ def find(query: GraspQuery) -> SupportPlane | None:
     likely = query.known_up is None and not (viewpoints[0] + query.offset).any()
     best, most = None, 0.0
     for planes in _parallel(surfaces, query.known_up, eye):
-        judged = [_judged(plane, surfaces, looked_at, viewpoints, eye) for plane in planes]
-        worth = max(one.worth for one in judged)
+        looked_for = (_judged(plane, surfaces, looked_at, viewpoints, eye) for plane in planes)
+        judged = [one for one in looked_for if one is not None]
+        worth = max((one.worth for one in judged), default=0.0)
         if likely:
-            worth *= max(_LEAST_LIKELIHOOD, float(judged[0].support.up @ _USUAL_UP)) ** 4
+            worth *= max(_LEAST_LIKELIHOOD, float(planes[0].up @ _USUAL_UP)) ** 4
         if worth > most:
             best, most = _nearest(judged), worth
     return None if best is None else best.support
@@ -181,8 +182,8 @@ class _Judged:
 
     Args:
         support: as it would be.
-        worth: how much speaks for it; 0 where it is none that things can stand on.
-        has_things: whether some do.
+        worth: how much speaks for it.
+        has_things: whether some stand on it.
     """
 
     support: SupportPlane
@@ -202,17 +203,18 @@ def _nearest(judged: list[_Judged]) -> _Judged:
 
 def _judged(
     plane: Plane, surfaces: Surfaces, looked_at: NDArray[np.float32], viewpoints: Array, eye: Array | None
-) -> _Judged:
-    """What speaks for a plane, by the surfaces that it is one of and more of the points (N, 3)."""
+) -> _Judged | None:
+    """What speaks for a plane that things can stand on, by the surfaces that it is one of and more points (N, 3)."""
+    area = _area(plane, surfaces.points)
+    if not _is_surface(plane, area, surfaces.points, eye):
+        return None
     over = looked_at @ plane.up.astype(looked_at.dtype) - plane.height
     about = np.flatnonzero(np.abs(over) <= NEAR)
     about = about[within(looked_at[about], plane.sides)]
     noise = DepthNoise.of(looked_at[about], over[about], viewpoints)
     noise = DepthNoise(viewpoints, plane.noise_sd, 0.0) if noise is None else noise
-    share, area = float(plane.own.mean()), _area(plane, surfaces.points)
+    share = float(plane.own.mean())
     support = SupportPlane(plane.up, plane.height, share, area, plane.noise_sd, plane.sides, noise)
-    if not _is_surface(plane, area, surfaces.points, eye):
-        return _Judged(support, 0.0, has_things=False)
     things = _things(looked_at, support)
     has_things = things >= FEW_THINGS
     share_of_things = things / len(looked_at) if has_things else 1.0 / len(looked_at)
@@ -223,13 +225,12 @@ def _things(points: NDArray[np.float32], plane: SupportPlane) -> int:
     """How many of the points (N, 3) are of things on a plane: of its region, but of nothing that reaches higher."""
     over = points @ plane.up.astype(points.dtype) - plane.height
     above = points[over > LOWEST]
-    if len(above) == 0:
+    things = region(above, plane)
+    if not things.any():
         return 0
-    u_v_height = above @ basis(plane.up).astype(points.dtype)
-    squares, square_of, _ = cells(u_v_height[:, :2], SQUARE)
-    top = np.full(len(squares), -np.inf)
-    np.maximum.at(top, square_of, u_v_height[:, 2] - plane.height)
-    return int((region(above, plane) & (top[square_of] <= TALLEST)).sum())
+    squares, square_of, _ = cells(above @ basis(plane.up)[:, :2].astype(points.dtype), SQUARE)
+    tall = np.bincount(square_of[over[over > LOWEST] > TALLEST], minlength=len(squares)) > 0
+    return int((things & ~tall[square_of]).sum())
 
 
 def _area(plane: Plane, points: Array) -> float:

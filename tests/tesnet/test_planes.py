@@ -86,3 +86,32 @@ def test_the_spread_of_a_sample_is_even() -> None:
     assert len(rows) == 1000
     assert (np.floor(rows / 300) == np.arange(1000)).all()
     assert len(np.unique(rows % 640)) > 300
+
+
+@pytest.mark.parametrize("reach", [0.5, 30.0, 400.0], ids=["all cells counted", "some sorted", "most sorted"])
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_cells_are_those_of_a_loop_over_the_points(dimensions: int, reach: float) -> None:
+    points = np.random.default_rng(dimensions).uniform(-reach, reach, (3000, dimensions))
+    points[1000:] *= 0.02
+    occupied, cell_of, sizes = planes.cells(points, 0.1)
+    indices = [tuple(np.floor(point / 0.1).astype(int).tolist()) for point in points]
+    ordered = sorted(set(indices))
+    np.testing.assert_array_equal(occupied, np.array(ordered) - np.min(ordered, axis=0))
+    assert [ordered[number] for number in cell_of] == indices
+    assert sizes.tolist() == [indices.count(index) for index in ordered]
+
+
+@pytest.mark.parametrize("farthest", [1e6, 1e9, 1e12, 1e30])
+def test_points_that_fly_however_far_leave_the_other_cells_as_they_are(farthest: float) -> None:
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)).astype(np.float32)
+    _, expected, _ = planes.cells(points, 0.1)
+    flying = np.array([[farthest, 0, 0], [0, -farthest, farthest]], dtype=np.float32)
+    _, cell_of, sizes = planes.cells(np.concatenate([points, flying]), 0.1)
+    assert len(set(zip(cell_of[:500].tolist(), expected.tolist(), strict=True))) == len(set(expected.tolist()))
+    assert sizes[cell_of[500:]].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100, 1001])
+def test_the_median_is_numpys(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count).round(1)
+    assert planes.median(values) == pytest.approx(np.median(values), abs=1e-12)

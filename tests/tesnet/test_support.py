@@ -111,6 +111,21 @@ def test_hardly_any_points_have_no_support_and_are_no_error(count: int) -> None:
     assert support.find(auto(np.zeros((count, 3)))) is None
 
 
+@pytest.mark.parametrize("farthest", [1e4, 1e9, 1e30])
+@pytest.mark.parametrize("up", ["auto", UP])
+def test_points_that_fly_however_far_do_not_change_the_support(up: Any, farthest: float) -> None:
+    points = np.concatenate([tabletop(0), table()])
+    plain = support.find(auto(points, up=up))
+    points[::4000] = farthest * np.array([[1, -1, -1]])
+    points[2000::4000] = farthest * np.array([[1, 1, 1]])
+    flying = auto(points, up=up)
+    found = support.find(flying)
+    assert plain is not None
+    assert found is not None
+    assert found.height == pytest.approx(plain.height, abs=1e-3)
+    assert len(fresh_predictor().predict(flying).grasps) == 10
+
+
 def test_grasps_with_auto_are_those_with_the_height_that_the_warning_names() -> None:
     """But for things that are lower than the noise of a support that has to be found."""
     things = tabletop(0)
