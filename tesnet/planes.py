@@ -262,6 +262,39 @@ def pieces(squares: Indices) -> Indices:
         label = lower
 
 
+def grown(squares: Mask) -> Mask:
+    """Mask (H, W) of squares, of those beside them and of those at their corners."""
+    rows = squares.copy()
+    rows[1:] |= squares[:-1]
+    rows[:-1] |= squares[1:]
+    both = rows.copy()
+    both[:, 1:] |= rows[:, :-1]
+    both[:, :-1] |= rows[:, 1:]
+    return both
+
+
+def left_out(free: Mask, starts: Mask) -> Mask:
+    """Mask (H, W) of the free squares (H, W) to which no way from square to square beside it leads from the starts.
+
+    Squares of the border count as not free.
+    """
+    inner = np.zeros_like(free)
+    inner[1:-1, 1:-1] = free[1:-1, 1:-1]
+    reached, count = starts & inner, 0
+    while reached.sum() > count:
+        count = reached.sum()
+        reached = _along_rows(_along_rows(reached, inner).T, inner.T).T
+    return inner & ~reached
+
+
+def _along_rows(reached: Mask, free: Mask) -> Mask:
+    """Mask (H, W) of the free squares that lie in one stretch of a row with a reached one; none is of the border."""
+    stretch = np.cumsum(~free)
+    reaches = np.zeros(stretch[-1] + 1, dtype=bool)
+    reaches[stretch[reached.ravel()]] = True
+    return free & reaches[stretch].reshape(free.shape)
+
+
 def basis(up: Array) -> Array:
     """(3, 3) with two directions across `up` and, last, `up` as columns."""
     across = np.cross(up, np.eye(3)[np.abs(up).argmin()])

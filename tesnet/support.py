@@ -13,7 +13,20 @@ from numpy.typing import NDArray
 
 from tesnet import plausibility
 from tesnet.depth_noise import NEAR, DepthNoise
-from tesnet.planes import SQUARE, TALLEST, Array, Mask, Plane, Surfaces, basis, cells, spread, within
+from tesnet.planes import (
+    SQUARE,
+    TALLEST,
+    Array,
+    Mask,
+    Plane,
+    Surfaces,
+    basis,
+    cells,
+    grown,
+    left_out,
+    spread,
+    within,
+)
 from tesnet.query import GraspQuery
 
 LOWEST = 0.003
@@ -24,7 +37,10 @@ DEVIATIONS = 4.0
 """Standard deviations over which noise lifts but a few of a hundred thousand points."""
 BELOW = 0.015
 MOST_SEEN_THROUGH = 0.15
-"""Of a plane's own points: so many others may be seen through it; more, and it is a slice of the air."""
+"""Of a plane's own points: so many others may be seen through it; more, and it is a slice of the air.
+
+Besides, as many as its own may be seen in its recesses.
+"""
 SMALL_AREA = 0.09
 MOST_UNDER = 0.2
 """Under the top of a box are its sides. For a plane under `SMALL_AREA` square metres: points straight below it, down to
@@ -247,14 +263,57 @@ def _is_surface(plane: Plane, area: float, points: Array, eye: Array | None) -> 
     under = (height < -BELOW) & (height > -TALLEST)
     if area < SMALL_AREA and (within(points, plane.sides) & under).sum() > MOST_UNDER * own:
         return False
-    return eye is None or _seen_through(plane, points, height, eye) <= MOST_SEEN_THROUGH * own
+    return eye is None or _hides(plane, points, height, eye)
 
 
-def _seen_through(plane: Plane, points: Array, height: Array, eye: Array) -> int:
-    """How many points behind the plane are seen where it should hide them."""
-    eye_height = float(eye @ plane.up - plane.height)
-    below = points[height < -BELOW]
-    share = eye_height / (eye_height - height[height < -BELOW])
-    crossings = eye + share[:, None] * (below - eye)
-    shrunk = plane.sides - np.array([0, 0, 0, SQUARE])
-    return int(within(crossings, shrunk).sum())
+def _hides(plane: Plane, points: Array, height: Array, eye: Array) -> bool:
+    """Whether hardly any of the points (P, 3) below it are seen through the plane, its recesses left out.
+
+    Heights (P,) are over the plane.
+    """
+    own, most = int(plane.own.sum()), MOST_SEEN_THROUGH * plane.own.sum()
+    through = _crossings(plane, points[height < -BELOW], eye)
+    inside = within(through, plane.sides - np.array([0, 0, 0, SQUARE]))
+    if inside.sum() <= most:
+        return True
+    near = within(through, plane.sides + np.array([0, 0, 0, 3 * SQUARE]))
+    through, inside = through[near], inside[near]
+    standing = (height > BELOW) & (height < min(TALLEST, float(eye @ plane.up - plane.height)))
+    hidden = _crossings(plane, points[standing], eye)
+    solid = np.concatenate([points[plane.own], hidden[within(hidden, plane.sides)]])
+    in_recess = inside & _in_recess(plane, through, solid)
+    return bool(in_recess.sum() <= own and (inside & ~in_recess).sum() <= most)
+
+
+def _crossings(plane: Plane, points: Array, eye: Array) -> Array:
+    """(N, 3) where the lines from the eye (3,) to points (N, 3) meet the plane."""
+    sights = points - eye
+    eye_height = eye @ plane.up - plane.height
+    return eye - (eye_height / (sights @ plane.up))[:, None] * sights
+
+
+def _in_recess(plane: Plane, through: Array, solid: Array) -> Mask:
+    """Mask (K,) of the places of a plane that lie in holes without a way out, such as that of a sink.
+
+    Out of its outline, that is, to where others are seen through it, too. What is no wider than two squares is a gap
+    between things, and no way.
+
+    Args:
+        plane: the plane.
+        through: (K, 3) places where others are seen through it.
+        solid: (S, 3) places where it is seen, or hidden behind what stands on it.
+    """
+    across = basis(plane.up)[:, :2]
+    index = np.floor(np.concatenate([through, solid]) @ across / SQUARE).astype(np.intp)
+    corner = index.min(axis=0) - 2
+    seen_through, is_solid = np.split(index - corner, [len(through)])
+    shape = tuple(index.max(axis=0) - corner + 3)
+    middles = (np.indices(shape).reshape(2, -1).T + corner + 0.5) * SQUARE
+    known = within(middles @ across.T, plane.sides).reshape(shape)
+    known[tuple(seen_through.T)] = True
+    filled, outside = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    filled[tuple(is_solid.T)] = True
+    outside[tuple(seen_through[~within(through, plane.sides + np.array([0, 0, 0, SQUARE]))].T)] = True
+    holes = grown(left_out(known & ~grown(filled), outside)) & ~filled
+    mask: Mask = holes[tuple(seen_through.T)]
+    return mask

@@ -115,3 +115,25 @@ def test_points_that_fly_however_far_leave_the_other_cells_as_they_are(farthest:
 def test_the_median_is_numpys(count: int) -> None:
     values = np.random.default_rng(count).normal(size=count).round(1)
     assert planes.median(values) == pytest.approx(np.median(values), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_squares_that_are_left_out_are_those_that_no_walk_from_the_starts_reaches(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = tuple(rng.integers(3, 14, 2))
+    free, starts = rng.random(shape) < rng.uniform(0.4, 0.8), rng.random(shape) < 0.05
+    rows, columns = shape
+    inner = {(row, column) for row in range(1, rows - 1) for column in range(1, columns - 1) if free[row, column]}
+    reached = {square for square in inner if starts[square]}
+    fresh = set(reached)
+    while fresh:
+        beside = {
+            (row + up, column + right) for row, column in fresh for up, right in ((0, 1), (1, 0), (0, -1), (-1, 0))
+        }
+        fresh = (beside & inner) - reached
+        reached |= fresh
+    assert set(zip(*np.nonzero(planes.left_out(free, starts)), strict=True)) == inner - reached
+    around = [(row + up, column + right) for row, column in inner for up in (-1, 0, 1) for right in (-1, 0, 1)]
+    cut = np.zeros(shape, dtype=bool)
+    cut[1:-1, 1:-1] = free[1:-1, 1:-1]
+    assert set(zip(*np.nonzero(planes.grown(cut)), strict=True)) == set(around)
