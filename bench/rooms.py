@@ -238,6 +238,30 @@ def empty(rng: np.random.Generator) -> Room:
     return Room(solids, eye, np.array([0, 0, 0.72]), 0.72, _corners(4.0, 4.0))
 
 
+def worktop(rng: np.random.Generator) -> Room:
+    """A worktop with a sink in it, at a wall, things beside the sink and a few in it."""
+    length, depth, height = rng.uniform([1.2, 0.58, 0.85], [1.8, 0.65, 0.92])
+    half_length, half_depth, deep = rng.uniform([0.17, 0.15, 0.14], [0.24, 0.2, 0.2])
+    left = half_length + rng.uniform(0.08, 0.25) - length / 2  # the middle of the sink
+    rim, beside = depth / 2 - half_depth, (left - half_length + length / 2, length / 2 - left - half_length)
+    parts = [
+        ((beside[0], depth, 0.04), (-length / 2 + beside[0] / 2, 0.0, -0.02)),
+        ((beside[1], depth, 0.04), (length / 2 - beside[1] / 2, 0.0, -0.02)),
+        *(((2 * half_length, rim, 0.04), (left, sign * (half_depth + rim / 2), -0.02)) for sign in (-1, 1)),
+        ((2 * half_length, 2 * half_depth, 0.01), (left, 0.0, -deep)),
+        *(((0.01, 2 * half_depth, deep), (left + sign * half_length, 0.0, -deep / 2)) for sign in (-1, 1)),
+        *(((2 * half_length, 0.01, deep), (left, sign * half_depth, -deep / 2)) for sign in (-1, 1)),
+        ((length, 0.02, height - 0.04), (0.0, -depth / 2 + 0.03, -height / 2 - 0.02)),
+    ]
+    solids = [_floor(), _wall(depth / 2 + 0.01)]
+    solids += [(Block(np.array(size) / 2), standing(x, y, height + z)) for size, (x, y, z) in parts]
+    middle = np.array([left + half_length + 0.2, -0.03])
+    solids += _things(rng, middle, 0.13, height, 5, tallest=0.16)
+    solids += _things(rng, np.array([left, 0.0]), 0.08, height + 0.005 - deep, 2, tallest=0.1)
+    seen = np.array([left + half_length, 0.0, height])
+    return Room(tuple(solids), seen + _sight(rng, 0.7, 1.0, 40, 60), seen, height, _corners(length, depth))
+
+
 KINDS: Mapping[str, Callable[[np.random.Generator], Room]] = {
     "table": table,
     "desk": desk,
@@ -248,6 +272,7 @@ KINDS: Mapping[str, Callable[[np.random.Generator], Room]] = {
     "cabinet": cabinet,
     "stairs": stairs,
     "empty": empty,
+    "worktop": worktop,
 }
 
 

@@ -11,7 +11,7 @@ from dataclasses import dataclass
 import numpy as np
 from numpy.typing import NDArray
 
-from tesnet.planes import Array, robust_sd, spread
+from tesnet.planes import Array, median, spread
 
 NEAR = 0.05
 """From a plane: what is farther is not its noise."""
@@ -75,20 +75,23 @@ def _measured(
     """
     inside = (distances >= low) & (distances <= high)
     below, heights = inside & (over < 0), over[inside]
-    deviation = 1.4826 * float(np.median(-over[below]))
+    deviation = 1.4826 * median(-over[below])
     for _ in range(_ROUNDS):
-        deviation = min(deviation, robust_sd(heights))
-        near = np.abs(heights - np.median(heights)) <= _CLIPPED_AT * deviation
+        away = np.abs(heights - median(heights))
+        deviation = min(deviation, 1.4826 * median(away))
+        near = away <= _CLIPPED_AT * deviation
         if not near.any():
             break
         heights = heights[near]
-    return float(np.median(distances[below])), deviation
+    return median(distances[below]), deviation
 
 
 def _distances(points: NDArray[np.floating], viewpoints: Array) -> Array:
     """(N,) from points (N, 3) to the nearest of the viewpoints (V, 3)."""
-    squares: Array = np.full(len(points), np.inf)
+    nearest: Array = np.full(len(points), np.inf)
     for viewpoint in viewpoints:
-        offsets = points - viewpoint.astype(points.dtype)
-        np.minimum(squares, np.einsum("ij,ij->i", offsets, offsets), out=squares)
-    return np.sqrt(squares, out=squares)
+        squares = np.zeros(len(points))
+        for column, place in zip(points.T, viewpoint, strict=True):  # several times as fast as all columns at once
+            squares += np.square(column - place)
+        np.minimum(nearest, squares, out=nearest)
+    return np.sqrt(nearest, out=nearest)

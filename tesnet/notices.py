@@ -36,15 +36,22 @@ def of_query(query: GraspQuery, *, knows_hands: bool) -> list[str]:
 
 def of_target(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
     """Why a target holds nothing that is left."""
-    if prepared.on_target is None or bool(prepared.on_target.any()):
+    if not _misses(prepared):
         return []
     if query.target is None or isinstance(query.target, Box):
         return ["target holds none of the points that are left after the crop: nothing can be grasped there"]
+    if not query.target.any():
+        return ["target has 0 points: nothing can be grasped there"]
     note = (
         f"target has {int(query.target.sum())} points, but no {config.voxel_size * 1000:g} mm cell that is left after "
         "the crop has as many of them as of others: mark all points of the object, or give a box"
     )
     return [note]
+
+
+def _misses(prepared: PreparedCloud) -> bool:
+    """Whether there is a target that holds nothing."""
+    return prepared.on_target is not None and not bool(prepared.on_target.any())
 
 
 def of_support(query: GraspQuery) -> list[str]:
@@ -57,12 +64,15 @@ def of_support(query: GraspQuery) -> list[str]:
 
 
 def of_answer(best: float, prepared: PreparedCloud, query: GraspQuery) -> list[str]:
-    """Whether the scores are so low that the scale may be wrong."""
+    """Whether the scores are so low that the scale may be wrong, unless it is known why they are."""
+    if best >= plausibility.LOW_SCORE or _misses(prepared) or query.image_scale == "unlikely":
+        return []
     points, sight = prepared.points.cpu().numpy(), prepared.view_directions.double().mean(dim=0).cpu().numpy()
     sight /= max(np.linalg.norm(sight), 1e-9)
     # Where nothing was found, what lies along the sight has not been seen, as of a box from straight above.
     measured = plausibility.extents(points) if best > 0 else plausibility.extents_across(points, sight)
-    return plausibility.answer_notes(best, _extent(query), measured, query.gripper.max_width)
+    of_image = query.image_scale is not None
+    return plausibility.answer_notes(best, _extent(query), measured, query.gripper.max_width, of_image=of_image)
 
 
 def _extent(query: GraspQuery) -> float:
@@ -72,11 +82,14 @@ def _extent(query: GraspQuery) -> float:
 
 def _of_posted(prepared: PreparedCloud, query: GraspQuery, config: PreparationConfig) -> list[str]:
     """What the posted points suggest, whatever of them was left to look for grasps on."""
-    extent = _extent(query)
     if len(prepared) < MINIMUM_POINTS:
-        note = plausibility.crowded(len(query.points), len(prepared), extent, config.voxel_size)
+        if query.image_scale == "unlikely":
+            return []
+        note = plausibility.crowded(len(query.points), len(prepared), _extent(query), config.voxel_size)
         return [] if note is None else [note]
-    notes = plausibility.cloud_notes(_spacing(prepared, query, config), extent, config.voxel_size)
+    notes = []
+    if query.image_scale is None:
+        notes += plausibility.cloud_notes(_spacing(prepared, query, config), _extent(query), config.voxel_size)
     if query.viewpoints is not None:
         enclosed = (plausibility.enclosed_viewpoint(query.points, viewpoint) for viewpoint in query.viewpoints)
         notes += [note for note in enclosed if note is not None]

@@ -29,10 +29,12 @@ APART = 2.0
 """Cells between neighbouring points from which on they describe no surface."""
 _FARTHEST, _NEAREST = 1.5, 0.05
 """Metres: hands work on what is nearer than the one, and hardly a camera sees what is nearer than the other."""
-_NEAR, _ALL_NEAR = 0.17, 0.25
-"""Metres within which most depth cameras measure nothing, and within which half of an image hardly is: the nearest
+_NEAR, _ALL_NEAR = 0.2, 0.25
+"""Metres within which most depth cameras measure nothing, and within which a quarter of an image hardly is: the nearest
 things alone may be a robot's own fingers."""
-_LIKELY_DEPTHS = (0.3, 1.5)
+_FAR = 10.0
+"""Metres beyond which hardly a depth camera sees."""
+_LIKELY_DEPTHS = (0.3, 4.0)
 _LIKELY_PLACES = (0.03, 5.0)
 """Metres from the origin of its frame at which a camera is put, by a hand or over a table."""
 _COUNTS: Mapping[float, str] = MappingProxyType({0.001: "1 mm", 0.0002: "1/5000 m", 0.0001: "0.1 mm"})
@@ -114,23 +116,36 @@ def depth_scale(depth: float, scale: float | None) -> str | None:
     what = f"the nearest things are {depth:.3g} m from the camera, "
     what += "where no hand reaches" if depth > _FARTHEST else "nearer than cameras see"
     if scale is None:
-        return f"{what}: depths of floating point must be metres: {_metres(depth)}"
+        return f"{what}: if that is not so, depths of floating point are no metres, as they must be: {_metres(depth)}"
     return f"{what}: if that is not so, depth_scale {scale:g} is wrong: {_other_scales(depth, scale)}"
 
 
-def all_near(nearest: float, middle: float, scale: float | None) -> str | None:
+def all_near(nearest: float, quarter: float, scale: float | None) -> str | None:
     """Whether an image shows what is nearer than cameras see, and another usual scale is more likely.
 
     Args:
         nearest: depth of the nearest things, metres.
-        middle: the median depth, metres.
+        quarter: depth that a quarter of what is seen is nearer than, metres.
         scale: metres per count; None where metres were given.
     """
-    if scale is None or nearest > _NEAR or middle > _ALL_NEAR or not (others := _likely_scales(nearest, scale)):
+    if scale is None or nearest > _NEAR or quarter > _ALL_NEAR or not (others := _likely_scales(nearest, scale)):
         return None
     return (
-        f"half of what is seen is within {middle:.2g} m of the camera, the nearest things at {nearest:.2g} m, nearer "
-        f"than most depth cameras see; if that is not so, depth_scale {scale:g} is wrong: {', '.join(others)}"
+        f"a quarter of what is seen is within {quarter:.2g} m of the camera, the nearest things at {nearest:.2g} m, "
+        f"nearer than most depth cameras see; if that is not so, depth_scale {scale:g} is wrong: {', '.join(others)}"
+    )
+
+
+def far_away(farthest: float, scale: float | None) -> str | None:
+    """Whether an image shows what is farther (metres) than cameras see, and another usual scale is more likely.
+
+    Of counts of `scale` metres; None where metres were given.
+    """
+    if scale is None or farthest <= _FAR or not (others := _likely_scales(farthest, scale)):
+        return None
+    return (
+        f"the farthest things are {farthest:.3g} m from the camera, farther than depth cameras see; if that is not so, "
+        f"depth_scale {scale:g} is wrong: {', '.join(others)}"
     )
 
 
@@ -156,7 +171,7 @@ def depths_beyond(diagonal: float, depth: float, scale: float | None) -> tuple[s
 
 def _other_scales(depth: float, scale: float) -> str:
     """What to do about a scale with which a depth (metres) is none that is likely."""
-    return ", ".join(_likely_scales(depth, scale)) or "give the metres of one count, 0.001 for millimetres"
+    return ", ".join(_likely_scales(depth, scale)) or "give the metres of one count of your camera"
 
 
 def _metres(depth: float) -> str:
@@ -180,8 +195,10 @@ def _likely_scales(depth: float, scale: float) -> list[str]:
     ]
 
 
-def depth_notes(camera: CameraIntrinsics, depths: NDArray[Any], scale: float | None, stride: int) -> list[str]:
-    """What is to be said of a depth image.
+def depth_notes(
+    camera: CameraIntrinsics, depths: NDArray[Any], scale: float | None, stride: int
+) -> tuple[list[str], bool]:
+    """What is to be said of a depth image, and whether its scale is a likely one.
 
     Args:
         camera: its camera.
@@ -189,16 +206,16 @@ def depth_notes(camera: CameraIntrinsics, depths: NDArray[Any], scale: float | N
         scale: metres per count.
         stride: between the pixels that are used.
     """
-    notes = [principal_point(camera)]
+    notes, wrong = [principal_point(camera)], None
     if len(depths) and min(camera.width, camera.height) >= _SMALLEST_IMAGE:
-        nearest, middle = (np.percentile(depths, [_NEAR_SHARE, 50]) * (1.0 if scale is None else scale)).tolist()
-        wrong = depth_scale(nearest, scale) or all_near(nearest, middle, scale)
-        notes += [wrong, pixel_pitch(camera, nearest, stride, _CELL)]
-    return [note for note in notes if note is not None]
+        nearest, quarter, farthest = (np.percentile(depths, _SHARES) * (1.0 if scale is None else scale)).tolist()
+        wrong = depth_scale(nearest, scale) or all_near(nearest, quarter, scale) or far_away(farthest, scale)
+        notes.append(wrong or pixel_pitch(camera, nearest, stride, _CELL))
+    return [note for note in notes if note is not None], wrong is None
 
 
-_NEAR_SHARE = 5
-"""Per cent of the depths that lie before the nearest things."""
+_SHARES = (5, 25, 95)
+"""Per cent of the depths: those that lie before the nearest things, a quarter, and those before the farthest things."""
 _CELL = 0.0045
 """Metres: the usual `tesnet.cloud.PreparationConfig.voxel_size`; which network answers is not known with an image."""
 
@@ -218,7 +235,9 @@ def cloud_notes(spacing: float, extent: float, cell: float) -> list[str]:
     return [note for note in notes if note is not None]
 
 
-def answer_notes(best: float, extent: float, extents: NDArray[np.float64], max_width: float) -> list[str]:
+def answer_notes(
+    best: float, extent: float, extents: NDArray[np.float64], max_width: float, *, of_image: bool = False
+) -> list[str]:
     """What is to be said where the best score is low; 0 where nothing was found.
 
     Args:
@@ -226,10 +245,9 @@ def answer_notes(best: float, extent: float, extents: NDArray[np.float64], max_w
         extent: of the posted cloud, from side to side, metres.
         extents: (E,) of what grasps were looked for on, metres.
         max_width: of the hand.
+        of_image: whether a depth image was posted, whose coordinates nobody has seen.
     """
-    if best >= LOW_SCORE:
-        return []
-    notes = [low_scores(best, extent), too_wide(best, extents, max_width)]
+    notes = [low_scores(best, extent, of_image=of_image), too_wide(best, extents, max_width)]
     return [note for note in notes if note is not None]
 
 
@@ -273,12 +291,14 @@ def crowded(posted: int, left: int, extent: float, cell: float) -> str | None:
     )
 
 
-def low_scores(best: float, extent: float) -> str | None:
+def low_scores(best: float, extent: float, *, of_image: bool = False) -> str | None:
     """Whether a scale that would fit stands beside scores that are all low; nothing found is a best score of 0."""
     if best >= LOW_SCORE or extent < _LIKELY_SPANS[1] or not (units := _likely_units(extent)):
         return None
     found = f"no score is over {best:.2f}" if best > 0 else "nothing was found"
-    return f"{found}, and the cloud spans {extent:.1f} m: check its unit, or depth_scale of an image; {units}"
+    if of_image:
+        return f"{found}, and what the image shows spans {extent:.1f} m: check depth_scale, the metres of one count"
+    return f"{found}, and the cloud spans {extent:.1f} m: check its unit; {units}"
 
 
 def too_wide(best: float, extents: NDArray[np.float64], max_width: float) -> str | None:

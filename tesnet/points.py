@@ -15,7 +15,7 @@ from torch import Tensor
 _QUERIES_AT_ONCE = 1_000
 """Neighbours of so many are looked for in one or two milliseconds, in which no other Python thread runs."""
 
-_SLAB_QUERIES, _STRIP_QUERIES = 384, 64
+_SLAB_QUERIES, _STRIP_QUERIES = 768, 128
 
 _NEARLY_FARTHEST = 0.7
 """Of the distance of the farthest point from those chosen: from here on a point is chosen in the same round."""

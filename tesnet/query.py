@@ -70,6 +70,8 @@ class GraspQuery:
         normals: (N, 3) outward, of any length, a row of zeros where there is none; turn ours.
         calibrate: whether each view's depth scale and a small tilt are solved from the support that it sees.
         origin: (3,) of this query's frame in that of the caller, whose axes are the same; None where they are one.
+        image_scale: whether that of the depth image whose points these are is likely to be right; None for points of
+            others, whose unit is still to be judged.
         ignored_points: how many were posted that are not finite and not among `points`.
         notes: what the caller is to be told about how these points came to be.
 
@@ -99,6 +101,7 @@ class GraspQuery:
     normals: NDArray[np.float32] | None = None
     calibrate: bool = False
     origin: NDArray[np.float64] | None = None
+    image_scale: Literal["likely", "unlikely"] | None = None
     ignored_points: int = 0
     notes: tuple[str, ...] = ()
 

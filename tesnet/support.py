@@ -13,7 +13,20 @@ from numpy.typing import NDArray
 
 from tesnet import plausibility
 from tesnet.depth_noise import NEAR, DepthNoise
-from tesnet.planes import SQUARE, TALLEST, Array, Mask, Plane, Surfaces, basis, cells, spread, within
+from tesnet.planes import (
+    SQUARE,
+    TALLEST,
+    Array,
+    Mask,
+    Plane,
+    Surfaces,
+    basis,
+    cells,
+    grown,
+    left_out,
+    spread,
+    within,
+)
 from tesnet.query import GraspQuery
 
 LOWEST = 0.003
@@ -24,7 +37,10 @@ DEVIATIONS = 4.0
 """Standard deviations over which noise lifts but a few of a hundred thousand points."""
 BELOW = 0.015
 MOST_SEEN_THROUGH = 0.15
-"""Of a plane's own points: so many others may be seen through it; more, and it is a slice of the air."""
+"""Of a plane's own points: so many others may be seen through it; more, and it is a slice of the air.
+
+Besides, as many as its own may be seen in its recesses.
+"""
 SMALL_AREA = 0.09
 MOST_UNDER = 0.2
 """Under the top of a box are its sides. For a plane under `SMALL_AREA` square metres: points straight below it, down to
@@ -151,10 +167,11 @@ def find(query: GraspQuery) -> SupportPlane | None:
     likely = query.known_up is None and not (viewpoints[0] + query.offset).any()
     best, most = None, 0.0
     for planes in _parallel(surfaces, query.known_up, eye):
-        judged = [_judged(plane, surfaces, looked_at, viewpoints, eye) for plane in planes]
-        worth = max(one.worth for one in judged)
+        looked_for = (_judged(plane, surfaces, looked_at, viewpoints, eye) for plane in planes)
+        judged = [one for one in looked_for if one is not None]
+        worth = max((one.worth for one in judged), default=0.0)
         if likely:
-            worth *= max(_LEAST_LIKELIHOOD, float(judged[0].support.up @ _USUAL_UP)) ** 4
+            worth *= max(_LEAST_LIKELIHOOD, float(planes[0].up @ _USUAL_UP)) ** 4
         if worth > most:
             best, most = _nearest(judged), worth
     return None if best is None else best.support
@@ -181,8 +198,8 @@ class _Judged:
 
     Args:
         support: as it would be.
-        worth: how much speaks for it; 0 where it is none that things can stand on.
-        has_things: whether some do.
+        worth: how much speaks for it.
+        has_things: whether some stand on it.
     """
 
     support: SupportPlane
@@ -202,17 +219,18 @@ def _nearest(judged: list[_Judged]) -> _Judged:
 
 def _judged(
     plane: Plane, surfaces: Surfaces, looked_at: NDArray[np.float32], viewpoints: Array, eye: Array | None
-) -> _Judged:
-    """What speaks for a plane, by the surfaces that it is one of and more of the points (N, 3)."""
+) -> _Judged | None:
+    """What speaks for a plane that things can stand on, by the surfaces that it is one of and more points (N, 3)."""
+    area = _area(plane, surfaces.points)
+    if not _is_surface(plane, area, surfaces.points, eye):
+        return None
     over = looked_at @ plane.up.astype(looked_at.dtype) - plane.height
     about = np.flatnonzero(np.abs(over) <= NEAR)
     about = about[within(looked_at[about], plane.sides)]
     noise = DepthNoise.of(looked_at[about], over[about], viewpoints)
     noise = DepthNoise(viewpoints, plane.noise_sd, 0.0) if noise is None else noise
-    share, area = float(plane.own.mean()), _area(plane, surfaces.points)
+    share = float(plane.own.mean())
     support = SupportPlane(plane.up, plane.height, share, area, plane.noise_sd, plane.sides, noise)
-    if not _is_surface(plane, area, surfaces.points, eye):
-        return _Judged(support, 0.0, has_things=False)
     things = _things(looked_at, support)
     has_things = things >= FEW_THINGS
     share_of_things = things / len(looked_at) if has_things else 1.0 / len(looked_at)
@@ -223,13 +241,12 @@ def _things(points: NDArray[np.float32], plane: SupportPlane) -> int:
     """How many of the points (N, 3) are of things on a plane: of its region, but of nothing that reaches higher."""
     over = points @ plane.up.astype(points.dtype) - plane.height
     above = points[over > LOWEST]
-    if len(above) == 0:
+    things = region(above, plane)
+    if not things.any():
         return 0
-    u_v_height = above @ basis(plane.up).astype(points.dtype)
-    squares, square_of, _ = cells(u_v_height[:, :2], SQUARE)
-    top = np.full(len(squares), -np.inf)
-    np.maximum.at(top, square_of, u_v_height[:, 2] - plane.height)
-    return int((region(above, plane) & (top[square_of] <= TALLEST)).sum())
+    squares, square_of, _ = cells(above @ basis(plane.up)[:, :2].astype(points.dtype), SQUARE)
+    tall = np.bincount(square_of[over[over > LOWEST] > TALLEST], minlength=len(squares)) > 0
+    return int((things & ~tall[square_of]).sum())
 
 
 def _area(plane: Plane, points: Array) -> float:
@@ -246,14 +263,57 @@ def _is_surface(plane: Plane, area: float, points: Array, eye: Array | None) -> 
     under = (height < -BELOW) & (height > -TALLEST)
     if area < SMALL_AREA and (within(points, plane.sides) & under).sum() > MOST_UNDER * own:
         return False
-    return eye is None or _seen_through(plane, points, height, eye) <= MOST_SEEN_THROUGH * own
+    return eye is None or _hides(plane, points, height, eye)
 
 
-def _seen_through(plane: Plane, points: Array, height: Array, eye: Array) -> int:
-    """How many points behind the plane are seen where it should hide them."""
-    eye_height = float(eye @ plane.up - plane.height)
-    below = points[height < -BELOW]
-    share = eye_height / (eye_height - height[height < -BELOW])
-    crossings = eye + share[:, None] * (below - eye)
-    shrunk = plane.sides - np.array([0, 0, 0, SQUARE])
-    return int(within(crossings, shrunk).sum())
+def _hides(plane: Plane, points: Array, height: Array, eye: Array) -> bool:
+    """Whether hardly any of the points (P, 3) below it are seen through the plane, its recesses left out.
+
+    Heights (P,) are over the plane.
+    """
+    own, most = int(plane.own.sum()), MOST_SEEN_THROUGH * plane.own.sum()
+    through = _crossings(plane, points[height < -BELOW], eye)
+    inside = within(through, plane.sides - np.array([0, 0, 0, SQUARE]))
+    if inside.sum() <= most:
+        return True
+    near = within(through, plane.sides + np.array([0, 0, 0, 3 * SQUARE]))
+    through, inside = through[near], inside[near]
+    standing = (height > BELOW) & (height < min(TALLEST, float(eye @ plane.up - plane.height)))
+    hidden = _crossings(plane, points[standing], eye)
+    solid = np.concatenate([points[plane.own], hidden[within(hidden, plane.sides)]])
+    in_recess = inside & _in_recess(plane, through, solid)
+    return bool(in_recess.sum() <= own and (inside & ~in_recess).sum() <= most)
+
+
+def _crossings(plane: Plane, points: Array, eye: Array) -> Array:
+    """(N, 3) where the lines from the eye (3,) to points (N, 3) meet the plane."""
+    sights = points - eye
+    eye_height = eye @ plane.up - plane.height
+    return eye - (eye_height / (sights @ plane.up))[:, None] * sights
+
+
+def _in_recess(plane: Plane, through: Array, solid: Array) -> Mask:
+    """Mask (K,) of the places of a plane that lie in holes without a way out, such as that of a sink.
+
+    Out of its outline, that is, to where others are seen through it, too. What is no wider than two squares is a gap
+    between things, and no way.
+
+    Args:
+        plane: the plane.
+        through: (K, 3) places where others are seen through it.
+        solid: (S, 3) places where it is seen, or hidden behind what stands on it.
+    """
+    across = basis(plane.up)[:, :2]
+    index = np.floor(np.concatenate([through, solid]) @ across / SQUARE).astype(np.intp)
+    corner = index.min(axis=0) - 2
+    seen_through, is_solid = np.split(index - corner, [len(through)])
+    shape = tuple(index.max(axis=0) - corner + 3)
+    middles = (np.indices(shape).reshape(2, -1).T + corner + 0.5) * SQUARE
+    known = within(middles @ across.T, plane.sides).reshape(shape)
+    known[tuple(seen_through.T)] = True
+    filled, outside = np.zeros(shape, dtype=bool), np.zeros(shape, dtype=bool)
+    filled[tuple(is_solid.T)] = True
+    outside[tuple(seen_through[~within(through, plane.sides + np.array([0, 0, 0, SQUARE]))].T)] = True
+    holes = grown(left_out(known & ~grown(filled), outside)) & ~filled
+    mask: Mask = holes[tuple(seen_through.T)]
+    return mask

@@ -63,13 +63,15 @@ def decode_depth(
     scale = None if image.dtype.kind == "f" else given.depth_scale
     points = _points(image, is_point, intrinsics, 1.0 if scale is None else scale, T_cloud_camera)
     _check_metres(points, depths, scale)
+    notes, is_likely = plausibility.depth_notes(intrinsics, depths, scale, given.stride)
     return Payload(
         points=points,
         options=options,
         is_point=is_point.ravel(),
         mask=None if labels is None else labels.ravel(),
         viewpoint=T_cloud_camera.translation,
-        notes=(*plausibility.depth_notes(intrinsics, depths, scale, given.stride), *_of_pose(T_cloud_camera)),
+        image_scale="likely" if is_likely else "unlikely",
+        notes=(*notes, *_of_pose(T_cloud_camera)),
         **others,
     )
 

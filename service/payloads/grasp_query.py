@@ -58,6 +58,7 @@ def build_query(payload: Payload, options: GraspOptions, max_points: int | None 
         model=options.model,
         view_index=_entries("view_index", payload.view_index, payload),
         normals=_entries("normals", payload.normals, payload),
+        image_scale=payload.image_scale,
         ignored_points=payload.ignored_points,
         notes=(*payload.notes, *seen, *note),
     )

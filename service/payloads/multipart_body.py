@@ -53,7 +53,7 @@ def _decode_cloud(file: memoryview, options: RawOptions, beside: BesidePoints, m
     refuse_empty(file, "file `cloud`")
     found = formats.format_of(file)
     if found is None:
-        raise Undecodable(f"The file `cloud` begins like none of {formats.LISTED}; send one of them.")
+        raise Undecodable(formats.why_of_none(file, "file `cloud`"))
     cloud = file_of(file, found.read, max_points)
     if cloud.normals is not None and "normals" not in beside:
         beside = {**beside, "normals": cloud.normals}

@@ -4,7 +4,7 @@ from __future__ import annotations
 
 from collections.abc import Mapping
 from dataclasses import dataclass, field
-from typing import Any, TypeAlias, TypedDict
+from typing import Any, Literal, TypeAlias, TypedDict
 
 import numpy as np
 from numpy.typing import NDArray
@@ -40,6 +40,7 @@ class Payload:
         file_viewpoint: (3,) the same, where the file of a cloud names it.
         view_index: (R,) which viewpoint saw each row.
         normals: (R, 3) that came with the rows; zeros where there is none.
+        image_scale: as `GraspQuery.image_scale`.
         ignored_points: rows with NaN or an infinity.
         notes: what the client is to be told.
     """
@@ -52,6 +53,7 @@ class Payload:
     file_viewpoint: NDArray[np.float64] | None = None
     view_index: NDArray[Any] | None = None
     normals: NDArray[Any] | None = None
+    image_scale: Literal["likely", "unlikely"] | None = None
     ignored_points: int = 0
     notes: tuple[str, ...] = ()
 

@@ -13,7 +13,7 @@ from tesnet.formats.header import Content
 from tesnet.formats.npy import is_npy, npy_array, read_npy
 from tesnet.formats.pcd import is_pcd, read_pcd
 from tesnet.formats.ply import is_ply, read_ply
-from tesnet.formats.text import is_text, read_text
+from tesnet.formats.text import is_text, line_before_points, read_text
 
 __all__ = [
     "FORMATS",
@@ -30,6 +30,7 @@ __all__ = [
     "format_of",
     "npy_array",
     "read",
+    "why_of_none",
 ]
 
 NPY = Format("NPY", (".npy",), "an array (N, 3) or (H, W, 3) of float32 or float64", is_npy, read_npy)
@@ -49,11 +50,24 @@ FORMATS = (NPY, PLY, PCD, TEXT)
 SUFFIXES = tuple(suffix for entry in FORMATS for suffix in entry.suffixes)
 LISTED = f"{', '.join(SUFFIXES[:-1])} or {SUFFIXES[-1]}"
 """The suffixes, for a sentence."""
+_MOST_CHARACTERS = 60
 
 
 def format_of(content: Content) -> Format | None:
     """The format that content begins like, whatever its file is called."""
     return next((entry for entry in FORMATS if entry.recognises(content)), None)
+
+
+def why_of_none(content: Content, name: str) -> str:
+    """What is wrong with content of no format that goes by this name, and the remedy."""
+    line = line_before_points(content)
+    if line is None:
+        return f"The {name} begins like none of {LISTED}; send one of them."
+    number, words = line
+    return (
+        f"The {name} has {words[:_MOST_CHARACTERS]!r} in line {number}, which is no point; delete it or begin it "
+        "with #: x, y, z of a point are the first three numbers of every other line."
+    )
 
 
 def read(content: Content, max_points: int | None = None) -> CloudFile:
@@ -67,5 +81,5 @@ def read(content: Content, max_points: int | None = None) -> CloudFile:
     """
     found = format_of(content)
     if found is None:
-        raise UnreadableFile(f"The file begins like none of {LISTED}; send one of them.")
+        raise UnreadableFile(why_of_none(content, "file"))
     return found.read(content, max_points)

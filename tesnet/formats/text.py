@@ -30,8 +30,28 @@ _NUMBER = re.compile(rb"[+-]?(?:nan|inf|\d+\.?\d*(?:e[+-]?\d+)?|\.\d+(?:e[+-]?\d
 
 def is_text(content: Content) -> bool:
     """Whether the first line that is no comment begins with three numbers."""
-    lines = (line.split() for line in _plain(beginning(content)).split(b"\n"))
-    words = next(filter(None, lines), [])
+    return _is_point(next(filter(None, _lines(content)), []))
+
+
+def line_before_points(content: Content) -> tuple[int, str] | None:
+    """Number, from 1, and words of the first line, where it is no point but a later one is, as below names of columns.
+
+    None for other content.
+    """
+    lines = _lines(content)
+    first = next((number for number, words in enumerate(lines) if words), len(lines))
+    if not any(map(_is_point, lines[first + 1 :])):
+        return None
+    words = b" ".join(lines[first]).decode("ascii", "replace")
+    return (first + 1, words) if words.isprintable() and "\ufffd" not in words else None
+
+
+def _lines(content: Content) -> list[list[bytes]]:
+    """The words of the first lines, of comments none."""
+    return [line.split() for line in _plain(beginning(content).replace(b"\r\n", b"\n")).split(b"\n")]
+
+
+def _is_point(words: list[bytes]) -> bool:
     return len(words) >= 3 and all(map(_NUMBER.fullmatch, words[:3]))
 
 

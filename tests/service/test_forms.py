@@ -4,6 +4,7 @@ from __future__ import annotations
 
 import io
 import json
+import re
 import struct
 import tracemalloc
 import zlib
@@ -384,6 +385,7 @@ def test_a_label_of_a_mask_is_the_target(http: httpx.Client, dtype: type) -> Non
     assert absent["grasps"] == []
     words = f"no pixel of the mask has; labels there: {min(label, 7)}, {max(label, 7)}"
     assert any(words in warning for warning in absent["warnings"])
+    assert not re.search("inches|unit|depth_scale|measures|metres", " ".join(absent["warnings"]))
 
 
 def test_a_stride_uses_every_so_many_th_pixel(http: httpx.Client) -> None:
@@ -529,6 +531,29 @@ def test_what_looks_like_a_mistake_is_a_warning(http: httpx.Client, cloud: Cloud
         answer = post(http, files, options)
         assert answer.status_code == 200, answer.text
         assert any(words in warning for warning in answer.json()["warnings"]), (words, answer.json()["warnings"])
+
+
+@pytest.mark.parametrize("times", [0.1, 5, 10])
+@pytest.mark.parametrize("target", [None, {"box": {"min": [-9, -9, -9], "max": [9, 9, 9]}}])
+def test_of_a_wrong_depth_scale_an_answer_says_one_thing(
+    http: httpx.Client, times: float, target: dict[str, Any] | None
+) -> None:
+    view = box_on_table()
+    options = {**view.camera, "depth_scale": 0.001 * times, "target": target, "max_candidates": 300}
+    warnings = post(http, {"depth": png(view.counts)}, options).json()["warnings"]
+    (said,) = [warning for warning in warnings if "depth_scale" in warning]
+    assert "need 0.001 (then" in said
+    assert not [warning for warning in warnings if re.search("multiply|divide|in metres|unit|inches", warning)]
+
+
+@pytest.mark.parametrize("names", ["x,y,z", "X Y Z intensity"])
+def test_text_with_names_of_columns_is_refused_with_the_line_and_the_remedy(
+    http: httpx.Client, cloud: Cloud, names: str
+) -> None:
+    rows = "\n".join(",".join(map(str, row)) for row in cloud[:100].tolist())
+    answer = post(http, {"cloud": f"{names}\n{rows}".encode()}, {})
+    problem_of(answer, 400, "in line 1, which is no point; delete it or begin it with #")
+    assert post(http, {"cloud": f"# {names}\n{rows}".encode()}, {}).status_code == 200
 
 
 def form_decoder(files: dict[str, bytes]) -> Callable[[dict[str, Any]], Payload]:

@@ -6,6 +6,7 @@ import codecs
 import importlib
 import io
 import itertools
+import re
 import tracemalloc
 from collections.abc import Callable
 from pathlib import Path
@@ -499,6 +500,26 @@ def test_what_is_no_cloud_file_is_not_taken_for_one(content: bytes) -> None:
     assert formats.format_of(content) is None
     with pytest.raises(UnreadableFile, match=r"none of \.npy, \.ply, \.pcd, \.xyz or \.txt"):
         formats.read(content)
+
+
+@pytest.mark.parametrize("names", ["x,y,z", "X;Y;Z;R;G;B", '"x" "y" "z"', "index,x,y,z", "250", "lengths in metres"])
+@pytest.mark.parametrize("end", ["\n", "\r\n", "\r"])
+@pytest.mark.parametrize("before", [(), ("# made by hand", ""), ("// x", "#", "")])
+def test_a_line_of_names_above_points_is_named_with_the_remedy(before: tuple[str, ...], end: str, names: str) -> None:
+    rows = [f"{row / 10},{row / 20},{row / 30}" for row in range(20)]
+    with pytest.raises(UnreadableFile) as refused:
+        formats.read(end.join([*before, names, *rows, ""]).encode())
+    assert f"in line {len(before) + 1}, which is no point; delete it or begin it with #" in str(refused.value)
+    assert re.split("[,; ]", names)[0] in str(refused.value)
+    assert len(formats.read(end.join([*before, f"# {names}", *rows, ""]).encode()).points) == 20
+
+
+def test_of_a_long_line_above_points_little_is_repeated_and_of_bytes_nothing() -> None:
+    with pytest.raises(UnreadableFile) as refused:
+        formats.read(b"word " * 5000 + b"\n1 2 3\n")
+    assert len(str(refused.value)) < 250
+    with pytest.raises(UnreadableFile, match="none of"):
+        formats.read(bytes(range(128, 256)) + b"\n1 2 3\n")
 
 
 def test_lists_that_change_their_length_too_often_are_refused_before_they_cost_seconds(

@@ -86,3 +86,54 @@ def test_the_spread_of_a_sample_is_even() -> None:
     assert len(rows) == 1000
     assert (np.floor(rows / 300) == np.arange(1000)).all()
     assert len(np.unique(rows % 640)) > 300
+
+
+@pytest.mark.parametrize("reach", [0.5, 30.0, 400.0], ids=["all cells counted", "some sorted", "most sorted"])
+@pytest.mark.parametrize("dimensions", [2, 3])
+def test_cells_are_those_of_a_loop_over_the_points(dimensions: int, reach: float) -> None:
+    points = np.random.default_rng(dimensions).uniform(-reach, reach, (3000, dimensions))
+    points[1000:] *= 0.02
+    occupied, cell_of, sizes = planes.cells(points, 0.1)
+    indices = [tuple(np.floor(point / 0.1).astype(int).tolist()) for point in points]
+    ordered = sorted(set(indices))
+    np.testing.assert_array_equal(occupied, np.array(ordered) - np.min(ordered, axis=0))
+    assert [ordered[number] for number in cell_of] == indices
+    assert sizes.tolist() == [indices.count(index) for index in ordered]
+
+
+@pytest.mark.parametrize("farthest", [1e6, 1e9, 1e12, 1e30])
+def test_points_that_fly_however_far_leave_the_other_cells_as_they_are(farthest: float) -> None:
+    points = np.random.default_rng(0).uniform(-0.5, 0.5, (500, 3)).astype(np.float32)
+    _, expected, _ = planes.cells(points, 0.1)
+    flying = np.array([[farthest, 0, 0], [0, -farthest, farthest]], dtype=np.float32)
+    _, cell_of, sizes = planes.cells(np.concatenate([points, flying]), 0.1)
+    assert len(set(zip(cell_of[:500].tolist(), expected.tolist(), strict=True))) == len(set(expected.tolist()))
+    assert sizes[cell_of[500:]].tolist() == [1, 1]
+
+
+@pytest.mark.parametrize("count", [1, 2, 7, 100, 1001])
+def test_the_median_is_numpys(count: int) -> None:
+    values = np.random.default_rng(count).normal(size=count).round(1)
+    assert planes.median(values) == pytest.approx(np.median(values), abs=1e-12)
+
+
+@pytest.mark.parametrize("seed", range(20))
+def test_squares_that_are_left_out_are_those_that_no_walk_from_the_starts_reaches(seed: int) -> None:
+    rng = np.random.default_rng(seed)
+    shape = tuple(rng.integers(3, 14, 2))
+    free, starts = rng.random(shape) < rng.uniform(0.4, 0.8), rng.random(shape) < 0.05
+    rows, columns = shape
+    inner = {(row, column) for row in range(1, rows - 1) for column in range(1, columns - 1) if free[row, column]}
+    reached = {square for square in inner if starts[square]}
+    fresh = set(reached)
+    while fresh:
+        beside = {
+            (row + up, column + right) for row, column in fresh for up, right in ((0, 1), (1, 0), (0, -1), (-1, 0))
+        }
+        fresh = (beside & inner) - reached
+        reached |= fresh
+    assert set(zip(*np.nonzero(planes.left_out(free, starts)), strict=True)) == inner - reached
+    around = [(row + up, column + right) for row, column in inner for up in (-1, 0, 1) for right in (-1, 0, 1)]
+    cut = np.zeros(shape, dtype=bool)
+    cut[1:-1, 1:-1] = free[1:-1, 1:-1]
+    assert set(zip(*np.nonzero(planes.grown(cut)), strict=True)) == set(around)

@@ -106,11 +106,40 @@ def test_a_scale_that_brings_all_of_an_image_near_is_named_where_a_usual_one_wou
     assert plausibility.all_near(0.6 * factor, 0.9 * factor, None) is None
 
 
-def test_an_image_in_a_tenth_of_its_scale_is_named_and_at_its_own_it_is_not() -> None:
-    depths = np.random.default_rng(0).integers(600, 1200, 5000)
-    (said,) = plausibility.depth_notes(CAMERA, depths, 0.0002, 1)
-    assert "counts of 1 mm need 0.001" in said
-    assert plausibility.depth_notes(CAMERA, depths, 0.001, 1) == []
+DEPTHS = {"a table": (0.5, 1.2), "a deep view": (1.0, 4.0), "a room": (0.6, 3.5), "a shelf": (0.4, 0.7)}
+
+
+@pytest.mark.parametrize(("near", "far"), list(DEPTHS.values()), ids=list(DEPTHS))
+@pytest.mark.parametrize(
+    ("right", "sent"), [(0.001, 0.0001), (0.0002, 0.001), (0.0001, 0.001), (0.001, 0.01), (0.001, 1.0)]
+)
+@pytest.mark.parametrize("seed", range(3))
+def test_a_wrong_scale_is_named_once_with_the_right_one_also_in_deep_views(
+    seed: int, right: float, sent: float, near: float, far: float
+) -> None:
+    """Of surfaces that go away from the camera, and of such with a wall behind them."""
+    rng = np.random.default_rng(seed)
+    counts = np.rint(np.append(rng.uniform(near, far, 4000), np.full(1000 * seed, far)) / right)
+    notes, is_likely = plausibility.depth_notes(CAMERA, counts, sent, 1)
+    assert not is_likely
+    assert len(notes) == 1
+    assert f"depth_scale {sent:g} is wrong" in notes[0]
+    assert f"need {right:g} (then" in notes[0]
+    notes, is_likely = plausibility.depth_notes(CAMERA, counts, right, 1)
+    assert is_likely
+    assert not [note for note in notes if "is wrong" in note]
+
+
+def test_what_is_farther_than_cameras_see_is_named_though_something_is_near() -> None:
+    """As by a robot's own arm in view."""
+    rng = np.random.default_rng(0)
+    counts = np.append(rng.integers(1000, 1500, 1000), rng.integers(5000, 15_000, 4000))
+    (said,), is_likely = plausibility.depth_notes(CAMERA, counts, 0.001, 1)
+    assert not is_likely
+    assert "farther than depth cameras see" in said
+    assert "counts of 1/5000 m need 0.0002" in said
+    assert plausibility.depth_notes(CAMERA, counts, 0.0002, 1)[1]
+    assert plausibility.far_away(14.0, None) is None
 
 
 def test_many_points_of_which_few_are_left_are_of_another_unit_where_they_lie_close() -> None:
@@ -123,10 +152,11 @@ def test_many_points_of_which_few_are_left_are_of_another_unit_where_they_lie_cl
 
 def test_the_notes_of_a_usual_image_are_none_and_those_of_small_ones_too() -> None:
     depths = np.full(1000, 500)
-    assert plausibility.depth_notes(CAMERA, depths, 0.001, 1) == []
-    assert len(plausibility.depth_notes(camera(cx=240, cy=320), 10 * depths, 0.001, 1)) == 3
-    assert plausibility.depth_notes(camera(4, 4), 10 * depths, 0.001, 1) == []
-    assert plausibility.depth_notes(CAMERA, depths[:0], 0.001, 1) == []
+    assert plausibility.depth_notes(CAMERA, depths, 0.001, 1) == ([], True)
+    assert len(plausibility.depth_notes(camera(cx=240, cy=320), 10 * depths, 0.001, 1)[0]) == 2
+    assert len(plausibility.depth_notes(camera(cx=240, cy=320), 2 * depths, 0.001, 16)[0]) == 2
+    assert plausibility.depth_notes(camera(4, 4), 10 * depths, 0.001, 1) == ([], True)
+    assert plausibility.depth_notes(CAMERA, depths[:0], 0.001, 1) == ([], True)
 
 
 @pytest.mark.parametrize(("name", "per_metre"), [("centimetres", 100), ("inches", 39.37), ("millimetres", 1000)])
@@ -163,6 +193,9 @@ def test_low_scores_are_put_down_to_the_scale_only_where_another_one_would_fit()
     assert "no hand of this size fits it" in extent
     assert plausibility.answer_notes(0.0, 0.15, extents * [1, 1, 0.5], 0.08) == []
     assert "nothing was found" in plausibility.answer_notes(0.0, 7.0, 50 * extents, 0.08)[0]
+    scale, _ = plausibility.answer_notes(0.1, 7.0, 50 * extents, 0.08, of_image=True)
+    assert "check depth_scale" in scale
+    assert "multiply" not in scale
 
 
 @given(st.integers(0, 100))

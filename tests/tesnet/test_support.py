@@ -111,6 +111,21 @@ def test_hardly_any_points_have_no_support_and_are_no_error(count: int) -> None:
     assert support.find(auto(np.zeros((count, 3)))) is None
 
 
+@pytest.mark.parametrize("farthest", [1e4, 1e9, 1e30])
+@pytest.mark.parametrize("up", ["auto", UP])
+def test_points_that_fly_however_far_do_not_change_the_support(up: Any, farthest: float) -> None:
+    points = np.concatenate([tabletop(0), table()])
+    plain = support.find(auto(points, up=up))
+    points[::4000] = farthest * np.array([[1, -1, -1]])
+    points[2000::4000] = farthest * np.array([[1, 1, 1]])
+    flying = auto(points, up=up)
+    found = support.find(flying)
+    assert plain is not None
+    assert found is not None
+    assert found.height == pytest.approx(plain.height, abs=1e-3)
+    assert len(fresh_predictor().predict(flying).grasps) == 10
+
+
 def test_grasps_with_auto_are_those_with_the_height_that_the_warning_names() -> None:
     """But for things that are lower than the noise of a support that has to be found."""
     things = tabletop(0)
@@ -277,6 +292,66 @@ def test_the_seat_of_a_stool_is_a_support_though_the_floor_shows_below_it(radius
     eye, corners = np.array([0, -0.55, 0.95]), rooms._corners(2 * radius, 2 * radius)
     room = rooms.Room((rooms._floor(), *stool, *things), eye, np.array([0, 0, 0.45]), 0.45, corners)
     assert_support_is_the_truth(rooms.photograph(room, rooms.VGA, 0.001, np.random.default_rng(0)), up)
+
+
+@pytest.mark.parametrize("up", ["auto", "given"])
+@pytest.mark.parametrize("seed", range(8))
+def test_a_worktop_with_a_sink_is_a_support_also_where_the_image_cuts_the_sink(seed: int, up: str) -> None:
+    rng = np.random.default_rng(seed)
+    frame = rooms.photograph(rooms.worktop(rng), (320, 240), 0.001 * (seed % 2), rng, rooms.FOCAL_SHARES[seed // 4])
+    assert_support_is_the_truth(frame, up)
+
+
+def above(solids: list[Placed], height: float, level: float = 0.0) -> rooms.Room:
+    """Solids on the floor, seen from 1.1 m; the truth is of a level of theirs, if it is not that of the floor."""
+    eye = np.array([0, -0.55, height + 0.95])
+    return rooms.Room((rooms._floor(), *solids), eye, np.array([0, 0, height]), level, rooms._corners(1.0, 1.0))
+
+
+def walled(half: Array, opening: Array, bottom: float, height: float) -> list[Placed]:
+    """Blocks about an opening of half so many metres, from a bottom to a height, half so wide together."""
+    (x, y), (inner_x, inner_y), middle = half, opening, (bottom + height) / 2
+    sizes = [((x - inner_x) / 2, y, (x + inner_x) / 2, 0.0), (inner_x, (y - inner_y) / 2, 0.0, (y + inner_y) / 2)]
+    return [
+        (Block(np.array([size_x, size_y, (height - bottom) / 2])), standing(sign * at_x, sign * at_y, middle))
+        for size_x, size_y, at_x, at_y in sizes
+        for sign in (-1, 1)
+    ]
+
+
+@pytest.mark.parametrize("up", ["auto", "given"])
+@pytest.mark.parametrize("opening", [0.08, 0.14, 0.2])
+def test_a_table_with_a_hole_is_a_support(opening: float, up: str) -> None:
+    """Through which the floor is seen."""
+    table_top = walled(np.array([0.5, 0.35]), np.full(2, opening), 0.69, 0.72)
+    things = [thing(0.35, 0.1, 0.06, 0.72), thing(-0.3, -0.2, 0.05, 0.72), thing(0.1, -0.28, 0.04, 0.72)]
+    frame = rooms.photograph(above([*table_top, *things], 0.72, 0.72), rooms.VGA, 0.001, np.random.default_rng(0))
+    assert_support_is_the_truth(frame, up)
+
+
+@pytest.mark.parametrize("up", ["auto", "given"])
+@pytest.mark.parametrize("flange", [0.01, 0.02, 0.03])
+def test_the_rim_of_a_bin_is_no_support_though_things_reach_over_it(flange: float, up: str) -> None:
+    inside = np.array([0.2, 0.15])
+    things = [(Block(np.array([0.03, 0.03, 0.1])), standing(x, y, 0.1, x)) for x, y in ((-0.1, 0.05), (0.05, -0.05))]
+    solids = [*walled(inside + flange, inside, 0.0, 0.15), *things, thing(0.12, 0.08, 0.05, 0.0)]
+    frame = rooms.photograph(above(solids, 0.1), rooms.VGA, 0.001, np.random.default_rng(0))
+    assert_support_is_the_truth(frame, up)
+
+
+@pytest.mark.parametrize("up", ["auto", "given"])
+@pytest.mark.parametrize("gap", [0.03, 0.06, 0.1, 0.16])
+@pytest.mark.parametrize("left_out", [(), ((0, 0),), ((0, 0), (0, 1))], ids=["all", "a ring", "a bay"])
+def test_tops_of_boxes_are_no_support_though_things_stand_on_them(
+    left_out: tuple[tuple[int, int], ...], gap: float, up: str
+) -> None:
+    """Nine boxes, as high as each other, or eight or seven about a place without one."""
+    box = Block(np.array([0.08, 0.06, 0.07]))
+    places = [place for place in itertools.product((-1, 0, 1), repeat=2) if place not in left_out]
+    boxes = [(box, standing(i * (0.16 + gap), j * (0.12 + gap), 0.07)) for i, j in places]
+    things = [thing(i * (0.16 + gap), j * (0.12 + gap), 0.05, 0.14) for i, j in ((-1, -1), (1, -1))]
+    frame = rooms.photograph(above([*boxes, *things], 0.1), rooms.VGA, 0.001, np.random.default_rng(0))
+    assert_support_is_the_truth(frame, up)
 
 
 def assert_support_is_the_truth(frame: rooms.RoomFrame, up: str) -> None:
