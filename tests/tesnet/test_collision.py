@@ -13,7 +13,7 @@ from tesnet import candidates, collision
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper, Pose
 from tesnet.obstacles import Obstacles
-from tests.tesnet.hand_twin import HANDS_TO_TRY, deepest_on_way
+from tests.tesnet.hand_twin import HANDS_TO_TRY, deepest_on_way, depth_in_hand
 from tests.tesnet.scenes import Array, bare_cloud, open_hands, prepared, tabletop_query
 
 ROUNDING = 1e-6
@@ -337,6 +337,20 @@ def test_a_hand_holds_things_from_so_many_points_so_deep_in_it_on(count: int, de
     posted = torch.from_numpy(pose.apply(np.concatenate([places, beside]))).float()
     hands = open_hands(torch.from_numpy(np.stack([pose.matrix, np.eye(4) + np.diag([0, 0, 5.0], 1)])).float())
     assert collision.holds(posted, hands)[0] == (count >= collision.HELD_POINTS and deeper > 0)
+
+
+def test_the_fingers_of_an_open_hand_hold_what_lies_outermost_in_them_however_it_is_turned(hand: Gripper) -> None:
+    rng = np.random.default_rng(0)
+    side, breadth = hand.max_width / 2, hand.finger_breadth / 2
+    finger = rng.uniform(
+        [-breadth, side, hand.palm_front], [breadth, side + hand.finger_thickness, hand.tip_offset], (20_000, 3)
+    )
+    deep = finger[depth_in_hand(finger, hand, hand.max_width) > collision.HELD_DEPTH + 1e-4]
+    outermost = deep[(deep @ [0.0, 1.0, 1.0]).argsort()[-collision.HELD_POINTS :]]
+    for seed in range(20):
+        pose = Pose.random(np.random.default_rng(seed), reach=0.2)
+        alone = opened(pose.matrix[None], np.array([hand.max_width]), hand)
+        assert collision.holds(torch.from_numpy(pose.apply(outermost)).float(), alone)[0]
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])
