@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -351,6 +352,28 @@ def test_the_fingers_of_an_open_hand_hold_what_lies_outermost_in_them_however_it
         pose = Pose.random(np.random.default_rng(seed), reach=0.2)
         alone = opened(pose.matrix[None], np.array([hand.max_width]), hand)
         assert collision.holds(torch.from_numpy(pose.apply(outermost)).float(), alone)[0]
+
+
+@pytest.mark.parametrize("rise", [0.0, 0.03])
+def test_a_palm_is_blocked_by_what_it_meets_wherever_the_hand_may_yet_be_moved(hand: Gripper, rise: float) -> None:
+    rng = np.random.default_rng(1)
+    palm, count, sweep = hand.parts[2], 800, np.array([0.0, 0.0, collision.APPROACH_DISTANCE])
+    corners = palm.corners(0.0)
+    low, high = corners.min(axis=0) - sweep, corners.max(axis=0)
+    places = rng.uniform(low - 0.03, high + 0.03, (count, 3))
+    moves = np.array([[rng.uniform(-0.03, 0.0), rng.uniform(0.0, 0.03)] for _ in range(count)])
+    planes = ConvexHull(np.concatenate([corners, corners - sweep])).equations
+    deepest = np.full(count, -np.inf)  # of all that it may be moved by, how far the palm's surface is: most is outside
+    for across, along in itertools.product(np.linspace(0, 1, 5), np.linspace(-rise, rise, 5)):
+        moved = places - np.outer(moves @ [1 - across, across], [0, 1, 0]) - [0, 0, along]
+        deepest = np.maximum(deepest, (moved @ planes[:, :3].T + planes[:, 3]).max(axis=1))
+    Ts = np.array([Pose.random(rng).matrix for _ in range(count)])
+    Ts[:, :3, 3] = -np.einsum("cij,cj->ci", Ts[:, :3, :3], places)  # the one point is the origin
+    hands = opened(Ts, np.full(count, hand.max_width), hand)
+    least, most = torch.from_numpy(moves).float().unbind(dim=1)
+    found = collision.palm_blocked(torch.zeros(1, 3), hands, least, most, rise, lambda: None).numpy()
+    assert_agree(found, -deepest)
+    assert 0.02 < found.mean() < 0.9
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])
