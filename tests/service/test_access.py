@@ -13,6 +13,7 @@ import pytest
 
 from service.access import DOCS_FILES, OPEN_PATHS
 from service.app import create_app
+from service.inference_protocol.tensors import HEADER_LENGTH
 from service.settings import load_settings
 from service.viewer import PAGE_PATHS
 
@@ -118,3 +119,22 @@ def test_browsers_are_not_let_in_unless_configured(serve: Serve, guarded: str) -
     assert httpx.get(f"{url}/model", headers={**page, "X-API-Key": "k"}).headers["Access-Control-Allow-Origin"]
     other = httpx.get(f"{url}/model", headers={"Origin": "https://evil.example", "X-API-Key": "k"})
     assert "Access-Control-Allow-Origin" not in other.headers
+
+
+def test_a_page_may_send_and_read_every_header_that_the_documentation_names(serve: Serve) -> None:
+    url = serve(**settings(GRASP_API_KEYS="k", GRASP_CORS_ORIGINS="https://robot.example")).url
+    page = {"Origin": "https://robot.example"}
+    document = httpx.get(f"{url}/openapi.json").json()
+    operations = [operation for path in document["paths"].values() for operation in path.values()]
+    parameters = [parameter for operation in operations for parameter in operation.get("parameters", ())]
+    answers = [answer for operation in operations for answer in operation["responses"].values()]
+    sent = {parameter["name"] for parameter in parameters if parameter["in"] == "header"}
+    assert sent >= {"X-Request-ID", "X-Request-Timeout"}
+    sent |= {"Authorization", "X-API-Key", "Accept", "Content-Type", HEADER_LENGTH}
+    preflight = {**page, "Access-Control-Request-Method": "POST"}
+    for name in (*sent, "X-Other"):
+        asked = httpx.options(f"{url}/grasps", headers={**preflight, "Access-Control-Request-Headers": name})
+        assert (asked.status_code == 200) == (name in sent), name
+    read = {"X-Request-ID", HEADER_LENGTH}.union(*(answer.get("headers", ()) for answer in answers))
+    shown = httpx.get(f"{url}/model", headers={**page, "X-API-Key": "k"}).headers["Access-Control-Expose-Headers"]
+    assert read == set(shown.split(", "))

@@ -2,14 +2,17 @@
 
 from __future__ import annotations
 
+from collections.abc import Callable
 from dataclasses import asdict
+from typing import Any
 
 import httpx
 import numpy as np
 import pytest
 from numpy.typing import NDArray
 
-from service.schemas import ModelResponse
+from service.schemas import MAX_TIMEOUT_S, ModelResponse
+from tesnet import query
 from tesnet.geometry import PANDA
 from tests.service.wire import post_octets
 
@@ -27,6 +30,20 @@ def test_model_tells_networks_frames_gripper_and_limits(http: httpx.Client, clou
         assert [section.model_dump() for section in told.sections] == [asdict(section) for section in part.sections]
     assert model.models[0].card
     assert model.device == "cpu"
+
+
+def test_every_limit_that_model_tells_is_the_one_that_holds(serve: Callable[..., Any]) -> None:
+    url = serve(max_points=1001, max_body_mb=3.0, queue_size=7).url
+    assert httpx.get(f"{url}/model").json()["limits"] == {
+        "max_points": 1001,
+        "max_body_bytes": 3 * 2**20,
+        "max_grasps": query.MAX_GRASPS,
+        "max_approach_points": query.MAX_APPROACH_POINTS,
+        "max_candidates": query.MAX_CANDIDATES,
+        "max_candidates_of_large_hands": query.MAX_CANDIDATES_OF_LARGE_HANDS,
+        "queue_size": 7,
+        "max_timeout_s": MAX_TIMEOUT_S,
+    }
 
 
 @pytest.mark.parametrize("path", ["/health/live", "/health/ready", "/v2/health/live", "/v2/health/ready"])

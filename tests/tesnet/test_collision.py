@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 from dataclasses import replace
 
 import numpy as np
@@ -13,7 +14,7 @@ from tesnet import candidates, collision
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper, Pose
 from tesnet.obstacles import Obstacles
-from tests.tesnet.hand_twin import HANDS_TO_TRY, deepest_on_way
+from tests.tesnet.hand_twin import HANDS_TO_TRY, deepest_on_way, depth_in_hand
 from tests.tesnet.scenes import Array, bare_cloud, open_hands, prepared, tabletop_query
 
 ROUNDING = 1e-6
@@ -337,6 +338,42 @@ def test_a_hand_holds_things_from_so_many_points_so_deep_in_it_on(count: int, de
     posted = torch.from_numpy(pose.apply(np.concatenate([places, beside]))).float()
     hands = open_hands(torch.from_numpy(np.stack([pose.matrix, np.eye(4) + np.diag([0, 0, 5.0], 1)])).float())
     assert collision.holds(posted, hands)[0] == (count >= collision.HELD_POINTS and deeper > 0)
+
+
+def test_the_fingers_of_an_open_hand_hold_what_lies_outermost_in_them_however_it_is_turned(hand: Gripper) -> None:
+    rng = np.random.default_rng(0)
+    side, breadth = hand.max_width / 2, hand.finger_breadth / 2
+    finger = rng.uniform(
+        [-breadth, side, hand.palm_front], [breadth, side + hand.finger_thickness, hand.tip_offset], (20_000, 3)
+    )
+    deep = finger[depth_in_hand(finger, hand, hand.max_width) > collision.HELD_DEPTH + 1e-4]
+    outermost = deep[(deep @ [0.0, 1.0, 1.0]).argsort()[-collision.HELD_POINTS :]]
+    for seed in range(20):
+        pose = Pose.random(np.random.default_rng(seed), reach=0.2)
+        alone = opened(pose.matrix[None], np.array([hand.max_width]), hand)
+        assert collision.holds(torch.from_numpy(pose.apply(outermost)).float(), alone)[0]
+
+
+@pytest.mark.parametrize("rise", [0.0, 0.03])
+def test_a_palm_is_blocked_by_what_it_meets_wherever_the_hand_may_yet_be_moved(hand: Gripper, rise: float) -> None:
+    rng = np.random.default_rng(1)
+    palm, count, sweep = hand.parts[2], 800, np.array([0.0, 0.0, collision.APPROACH_DISTANCE])
+    corners = palm.corners(0.0)
+    low, high = corners.min(axis=0) - sweep, corners.max(axis=0)
+    places = rng.uniform(low - 0.03, high + 0.03, (count, 3))
+    moves = np.array([[rng.uniform(-0.03, 0.0), rng.uniform(0.0, 0.03)] for _ in range(count)])
+    planes = ConvexHull(np.concatenate([corners, corners - sweep])).equations
+    deepest = np.full(count, -np.inf)  # of all that it may be moved by, how far the palm's surface is: most is outside
+    for across, along in itertools.product(np.linspace(0, 1, 5), np.linspace(-rise, rise, 5)):
+        moved = places - np.outer(moves @ [1 - across, across], [0, 1, 0]) - [0, 0, along]
+        deepest = np.maximum(deepest, (moved @ planes[:, :3].T + planes[:, 3]).max(axis=1))
+    Ts = np.array([Pose.random(rng).matrix for _ in range(count)])
+    Ts[:, :3, 3] = -np.einsum("cij,cj->ci", Ts[:, :3, :3], places)  # the one point is the origin
+    hands = opened(Ts, np.full(count, hand.max_width), hand)
+    least, most = torch.from_numpy(moves).float().unbind(dim=1)
+    found = collision.palm_blocked(torch.zeros(1, 3), hands, least, most, rise, lambda: None).numpy()
+    assert_agree(found, -deepest)
+    assert 0.02 < found.mean() < 0.9
 
 
 @pytest.mark.parametrize("share", [0.2, 1.0])

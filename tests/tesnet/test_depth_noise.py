@@ -48,6 +48,12 @@ def test_things_alone_are_no_plane() -> None:
     assert DepthNoise.of(points[:10], over[:10], EYE) is None
 
 
+def test_nearer_than_where_noise_begins_there_is_none() -> None:
+    noise = DepthNoise(EYE, -0.001, 0.002)
+    places = EYE[0] + np.array([0.0, 0.4, 0.5, 0.6, 1.0])[:, None] * np.array([0.0, 0.6, -0.8])
+    np.testing.assert_allclose(noise.at(places), [0.0, 0.0, 0.0, 0.0002, 0.001], atol=1e-12)
+
+
 def test_of_several_viewpoints_the_nearest_counts() -> None:
     noise = DepthNoise(np.array([[0.0, 0.0, 1.0], [3.0, 0.0, 1.0]]), 0.0, 0.001)
     np.testing.assert_allclose(noise.at(np.array([[0.0, 0, 0], [3.0, 0, 0], [3.0, 0, 3.0]])), [0.001, 0.001, 0.002])

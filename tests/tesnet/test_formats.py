@@ -316,6 +316,60 @@ PLY_FILE = b"ply\nformat ascii 1.0\nelement vertex 1\n" + _XYZ + b"end_header\n1
 PCD_FILE = (
     b"VERSION 0.7\nFIELDS x y z\nSIZE 4 4 4\nTYPE F F F\nCOUNT 1 1 1\nWIDTH 1\nHEIGHT 1\nPOINTS 1\nDATA ascii\n1 2 3\n"
 )
+
+
+PLY_NUMBERS = {
+    **dict.fromkeys(("char", "int8"), "i1"),
+    **dict.fromkeys(("uchar", "uint8"), "u1"),
+    **dict.fromkeys(("short", "int16"), "i2"),
+    **dict.fromkeys(("ushort", "uint16"), "u2"),
+    **dict.fromkeys(("int", "int32"), "i4"),
+    **dict.fromkeys(("uint", "uint32"), "u4"),
+    **dict.fromkeys(("float", "float32"), "f4"),
+    **dict.fromkeys(("double", "float64"), "f8"),
+}
+"""The format's names of types, as its authors and as later writers have them."""
+
+
+def ends_of(kind: str) -> Array:
+    """One point with the least and the largest number of a type, and with one between."""
+    dtype = np.dtype(kind)
+    ends = np.finfo(dtype) if dtype.kind == "f" else np.iinfo(dtype)
+    return np.array([[ends.min, 1, ends.max]], dtype)
+
+
+@pytest.mark.parametrize("name", PLY_NUMBERS)
+@pytest.mark.parametrize(("layout", "order"), [("binary_little_endian", "<"), ("binary_big_endian", ">")])
+def test_a_ply_holds_numbers_of_every_type_to_the_ends_of_its_range(name: str, layout: str, order: str) -> None:
+    point = ends_of(order + PLY_NUMBERS[name])
+    head = f"ply\nformat {layout} 1.0\nelement vertex 1\n" + _XYZ.decode().replace("float", name) + "end_header\n"
+    np.testing.assert_array_equal(read_ply(head.encode() + point.tobytes()).points, point)
+
+
+@pytest.mark.parametrize("name", ["char", "uchar", "short", "ushort", "int", "uint"])
+def test_a_list_of_a_ply_is_as_long_as_the_type_of_its_length_allows(name: str) -> None:
+    length = np.array(min(np.iinfo(PLY_NUMBERS[name]).max, 70_000), "<" + PLY_NUMBERS[name])
+    head = f"element before 1\nproperty list {name} uchar l\nelement vertex 1\n".encode() + _XYZ
+    point = np.array([[1, 2, 3]], "<f4")
+    data = length.tobytes() + bytes(int(length)) + point.tobytes()
+    content = b"ply\nformat binary_little_endian 1.0\n" + head + b"end_header\n" + data
+    np.testing.assert_array_equal(read_ply(content).points, point)
+
+
+@pytest.mark.parametrize("kind", ["F4", "F8", "I1", "I2", "I4", "I8", "U1", "U2", "U4", "U8"])
+@pytest.mark.parametrize("encoding", ["binary", "binary_compressed"])
+def test_a_pcd_holds_numbers_of_every_type_to_the_ends_of_its_range(kind: str, encoding: str) -> None:
+    point = ends_of("<" + kind.lower())
+    head = PCD_FILE.replace(b"SIZE 4 4 4", f"SIZE {' '.join(3 * kind[1])}".encode())
+    head = head.replace(b"TYPE F F F", f"TYPE {' '.join(3 * kind[0])}".encode())
+    data = point.tobytes()
+    if encoding == "binary_compressed":
+        packed = bytes([len(data) - 1]) + data  # as LZF has bytes that do not repeat
+        data = len(packed).to_bytes(4, "little") + len(data).to_bytes(4, "little") + packed
+    content = head.replace(b"DATA ascii\n1 2 3\n", f"DATA {encoding}\n".encode() + data)
+    np.testing.assert_array_equal(read_pcd(content).points, point)
+
+
 COMPRESSED = PCD_FILE.replace(b"ascii\n1 2 3\n", b"binary_compressed\n")
 
 

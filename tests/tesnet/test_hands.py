@@ -168,6 +168,20 @@ def test_the_clearance_holds_for_the_lowest_tip_on_the_way(name: str) -> None:
 
 
 @pytest.mark.parametrize("name", ARCS)
+@pytest.mark.parametrize("share", [0.3, 0.7, 1.0])
+def test_of_a_hand_that_closes_straight_down_on_nothing_the_clearance_is_exact(name: str, share: float) -> None:
+    """Also where the tips are lowest between two of the openings that are looked at."""
+    hand = HANDS[name].gripper
+    cloud = bare_cloud(np.zeros((1, 3)), up=torch.tensor([0.0, 0.0, 1.0]).double(), support_height=-0.1)
+    pose = torch.diag(torch.tensor([1.0, -1.0, -1.0, 1.0])).double()[None]
+    width, point = share * hand.max_width, torch.zeros(1).long()
+    found = candidates.Candidates(point, point, pose, torch.tensor([width]).double(), hand)
+    farthest = max(from_base(hand, closing) for closing in np.linspace(0, width, 4001)) - from_base(hand, width)
+    clearance = float(candidates.hand_clearance(cloud, found))
+    assert clearance == pytest.approx(0.1 - hand.tip_offset - farthest, abs=1e-7)
+
+
+@pytest.mark.parametrize("name", ARCS)
 def test_a_low_thing_is_held_where_the_tips_come_to_rest_over_the_support(name: str) -> None:
     """A slab 12 mm high, pairs of its top and of its wall: the hand stops short as if it had slid there closed."""
     hand = HANDS[name].gripper

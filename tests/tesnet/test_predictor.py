@@ -3,6 +3,7 @@ from __future__ import annotations
 import functools
 import subprocess
 import sys
+import time
 from dataclasses import replace
 from pathlib import Path
 from typing import Any
@@ -306,6 +307,22 @@ def test_another_query_may_be_answered_while_one_is_asked_whether_to_go_on() -> 
     for result in between:
         assert_equal(result, between[0])
     assert_equal(between[0], predictor().predict(other))
+
+
+def test_the_time_that_asking_whether_to_go_on_takes_is_no_stages() -> None:
+    asked = [0.0]
+
+    def go_on() -> bool:
+        began = time.perf_counter()
+        time.sleep(0.003)
+        asked[0] += time.perf_counter() - began
+        return False
+
+    began = time.perf_counter()
+    result = predictor().predict(tabletop_query(max_candidates=100), go_on)
+    took = time.perf_counter() - began
+    assert asked[0] > 0.02
+    assert sum(result.timings_ms.values()) <= 1e3 * (took - asked[0])
 
 
 def test_the_global_random_state_is_neither_read_nor_changed() -> None:

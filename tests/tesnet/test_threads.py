@@ -87,6 +87,27 @@ def test_where_nobody_tells_what_is_idle_trials_become_rare_and_never_end() -> N
     assert LONGEST_PAUSE <= pauses[-1] <= LONGEST_PAUSE + 1
 
 
+def test_a_trial_that_goes_well_makes_the_pauses_short_again() -> None:
+    """After long trouble and then a free machine, a moment's trouble is as soon over as the first one was."""
+    machine = Machine(2, tells_idle=False)
+    threads = machine.threads(2)
+
+    def pieces_with_one_thread() -> int:
+        machine.neighbours = 2
+        machine.work(threads)
+        machine.neighbours = 0
+        return sum(machine.work(threads) == 1 for _ in range(3 * LONGEST_PAUSE))
+
+    first = pieces_with_one_thread()
+    machine.neighbours = 1
+    for _ in range(5 * LONGEST_PAUSE):
+        machine.work(threads)
+    machine.neighbours = 0
+    for _ in range(3 * LONGEST_PAUSE):
+        machine.work(threads)
+    assert pieces_with_one_thread() == first
+
+
 def test_short_pieces_are_judged_together() -> None:
     machine = Machine(2)
     threads = machine.threads(2)

@@ -75,6 +75,12 @@ def test_a_stopped_run_goes_on_from_its_checkpoint(folder: Path, tmp_path: Path)
     assert set(measured) == {"weights_sha256", "all", "packed", "by_hand", "by_sensor", "by_width"}
 
 
+def test_a_run_of_more_epochs_than_the_recipe_has_ends_with_the_recipe(folder: Path, tmp_path: Path) -> None:
+    run(folder, tmp_path / "a.safetensors", replace(RECIPE, max_epochs=1), epochs=3)
+    log = (tmp_path / "a.log.jsonl").read_text().splitlines()
+    assert [json.loads(line)["epoch"] for line in log] == [1]
+
+
 def test_a_run_that_is_stopped_within_an_epoch_ends_as_if_it_had_not_been(
     folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
 ) -> None:

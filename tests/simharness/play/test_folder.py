@@ -49,6 +49,20 @@ def test_a_round_that_a_crash_cut_short_is_played_again(tmp_path: Path, make_set
     assert len(attempts.read_text().splitlines()) == 5
 
 
+def test_a_round_is_told_of_once_all_its_attempts_are_written(tmp_path: Path, make_settings: Any, run: Run) -> None:
+    folder = RunFolder(tmp_path)
+    folder.prepare(make_settings(), resume=False)
+    folder.append(run.rounds[0])
+    (tmp_path / "attempts.jsonl").rename(tmp_path / "aside")
+    (tmp_path / "attempts.jsonl").mkdir()  # where nothing can be written
+    with pytest.raises(OSError, match=r"attempts\.jsonl"):
+        folder.append(run.rounds[1])
+    (tmp_path / "attempts.jsonl").rmdir()
+    (tmp_path / "aside").rename(tmp_path / "attempts.jsonl")
+    assert len((tmp_path / "rounds.jsonl").read_text().splitlines()) == 1
+    assert same(folder.read_rounds(), [run.rounds[0]])
+
+
 def test_resuming_refuses_other_settings_by_name(tmp_path: Path, make_settings: Any) -> None:
     folder = RunFolder(tmp_path)
     folder.prepare(make_settings(), resume=False)

@@ -11,6 +11,7 @@ from pathlib import Path
 from typing import Any
 
 import pytest
+from PIL import Image
 
 from simharness.__main__ import main
 from simharness.errors import RunBroken
@@ -31,6 +32,14 @@ def test_results_do_not_depend_on_the_number_of_workers(two_rounds: Path, start_
     done = run_it("--rounds", 2, "--url", start_stub(), "--workers", 2, "--out", out)
     assert done.returncode == 0, done.stderr
     assert results(out) == results(two_rounds)
+
+
+def test_pictures_of_a_run_that_nobody_watches_tell_objects_apart(two_rounds: Path) -> None:
+    pictures = list((two_rounds / "pictures").glob("*-segmentation.png"))
+    assert pictures
+    for path in pictures:
+        with Image.open(path) as image:
+            assert len(image.convert("RGB").getcolors(1 << 16) or ()) >= 2, path.name
 
 
 def test_a_service_that_dies_breaks_the_run_and_resume_finishes_it(

@@ -4,15 +4,16 @@ from __future__ import annotations
 
 import json
 import xml.etree.ElementTree as ET
-from dataclasses import asdict
+from dataclasses import asdict, replace
 from pathlib import Path
+from statistics import median
 from typing import Any
 
 import pytest
 
 from simharness.__main__ import main
 from simharness.errors import UsageError
-from simharness.play.records import ModelRecord, Run
+from simharness.play.records import Latency, ModelRecord, NoGraspRecord, Run
 from simharness.play.round import camera_sensor
 from simharness.play.settings import RunSettings
 from simharness.report.robustness import AXES, AXIS_NAMES, Condition, Study, conditions
@@ -56,6 +57,22 @@ def test_a_study_gives_counts_and_intervals_beside_every_rate(make_settings: Any
     assert "| 5 mm | 75.0 [40.9, 92.9] | 6 of 8 | 60.0 [31.3, 83.2] | 6 of 10 | 100 |" in study.table()
     drawing = ET.fromstring(study.plot())
     assert len(drawing.findall(".//{*}circle/{*}title")) == 2 * len(AXES["points"].levels)
+
+
+def test_the_points_of_a_condition_are_those_of_all_its_requests(make_settings: Any, make_round: Any) -> None:
+    """Of looks that gave no grasp, which have the fewest, too; no request was made where the camera saw nothing."""
+    one, two = finished(make_settings(), make_round).rounds
+    tried = tuple(replace(attempt, counts={"points": 10 * number}) for number, attempt in enumerate(one.attempts, 7))
+    unseen = NoGraspRecord(5, "no_points_in_workspace", {}, None)
+    looks = tuple(NoGraspRecord(number, "no_candidates", {"points": number}, Latency(1.0, 2.0)) for number in range(7))
+    run = replace(
+        finished(make_settings(), make_round),
+        rounds=(replace(one, attempts=tried), replace(two, attempts=(), no_grasps=(*looks, unseen))),
+    )
+    study = Study(make_settings(), ["points"])
+    study.add(conditions(["points"])[0], run)
+    (measured,) = study.report({})["conditions"].values()
+    assert measured["points_median"] == median([*range(7), 70, 80, 90, 100, 110])
 
 
 def test_a_study_that_was_broken_off_says_so(make_settings: Any, make_round: Any) -> None:

@@ -120,6 +120,21 @@ def test_a_contact_on_the_way_fails_under_strict_and_pushes_under_edge() -> None
         assert outcome.kind in ("success", "slip", "drop")
 
 
+@pytest.mark.parametrize(("executor", "goes_on"), [("strict", False), ("edge", True)])
+def test_a_hand_that_touches_something_on_its_way_goes_on_to_the_grasp_under_edge_alone(
+    executor: Executor, goes_on: bool
+) -> None:
+    # One fingertip meets a neighbour 4 cm before the grasp and takes it along, if the hand goes on.
+    with World() as world:
+        hand, (_, neighbour) = scene(world, MIDDLE, (0.138, 0.205))
+        before = world.position(neighbour)[0]
+        outcome = attempt(world, hand, from_the_side(TABLE_HEIGHT + 0.04), PANDA.max_width, executor)
+        assert not outcome.contact_at_start
+        assert outcome.contact_on_way
+        pushed = world.position(neighbour)[0] - before
+    assert (pushed > 0.03) if goes_on else (abs(pushed) < 0.01)
+
+
 def test_the_table_counts_as_a_contact_on_the_way() -> None:
     with World() as world:
         hand, _ = scene(world, MIDDLE)

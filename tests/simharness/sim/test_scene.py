@@ -238,6 +238,16 @@ def test_a_thing_of_its_own_size_keeps_it_around_the_middle_of_the_scales(kind: 
             assert 2 * low / (low + high) <= item.scale <= 2 * high / (low + high)
 
 
+@pytest.mark.parametrize("kind", SCALE_RANGES)
+def test_a_thing_of_its_own_size_follows_the_scales_that_are_asked_for(kind: SceneKind) -> None:
+    sized, middle = replace(CUBE, sized=True), sum(SCALE_RANGES[kind]) / 2
+    with World() as world:
+        items = make_scene(world, kind, [sized], np.random.default_rng(2), 2, scale_range=(0.5, 0.55)).placed
+    assert items
+    for item in items:
+        assert 0.5 <= item.scale * middle <= 0.55
+
+
 def test_crowded_tables_hold_more_than_five() -> None:
     small = replace(CUBE, scale_hint=0.4)
     with World() as world:
