@@ -10,6 +10,7 @@ from __future__ import annotations
 
 import argparse
 import contextlib
+import io
 import json
 import os
 import subprocess
@@ -23,13 +24,14 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
+from PIL import Image
 
 from bench import predict
 from bench.scene import five_objects
 from bench.serve import memory_mb
 from bench.table import processor
 from service.errors import ServiceError
-from service.payloads import decoder_for
+from service.payloads import decoder_for, most_rows
 from service.settings import Settings
 from tesnet.errors import InvalidQuery, TesnetError
 from tesnet.geometry import WIDEST, Box, Gripper
@@ -42,6 +44,8 @@ MOST_POINTS = Settings().max_points
 MOST_BYTES = Settings().max_body_bytes
 LONGEST_PART = 0.5
 """Metres: of a hand."""
+MOST_WIDE = 4000
+"""Pixels."""
 RUNS = 11
 
 Array = NDArray[Any]
@@ -69,12 +73,18 @@ def clouds() -> Mapping[str, Callable[[], GraspQuery]]:
         things = rng.uniform([-0.5, -0.5, 0], [0.5, 0.5, 0.1], (MOST_POINTS - len(top), 3))
         return of(np.concatenate([top, things]))
 
+    def image() -> GraspQuery:
+        """Of the most pixels, of which the workspace keeps little."""
+        points = rng.uniform([-0.2, -0.15, 0.5], [0.2, 0.15, 1.5], (most_rows(MOST_POINTS), 3))
+        return replace(of(points), workspace=Box(np.array([-0.05, -0.05, 0.1]), np.array([0.05, 0.05, 2.0])))
+
     return {
         "20,000 points": lambda: small,
         "a sheet along a side": sheet,
         "most points, 0.3 m wide": lambda: of(rng.uniform(-0.15, 0.15, (MOST_POINTS, 3))),
         "most points, 4 m wide": lambda: of(rng.uniform(-2, 2, (MOST_POINTS, 3))),
         "most points, a table": table,
+        "most pixels, of which few matter": image,
     }
 
 
@@ -146,7 +156,20 @@ def bodies() -> Mapping[str, tuple[str, Callable[[], bytes]]]:
     def padded(start: bytes, fill: bytes, end: bytes = b"") -> bytes:
         return start + fill * ((MOST_BYTES - len(start) - len(end)) // len(fill)) + end
 
+    def depth(file: bytes) -> bytes:
+        """Of an image, of which the workspace keeps little."""
+        names = ("depth", "options")
+        camera = {"fx": 3000.0, "fy": 3000.0, "cx": MOST_WIDE / 2, "cy": most_high / 2}
+        corner = {"min": [-0.05, -0.05, 0.1], "max": [0.05, 0.05, 2.0]}
+        told = json.dumps({"intrinsics": camera, "workspace": corner}).encode()
+        heads = [f'--b\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'.encode() for name in names]
+        return heads[0] + file + b"\r\n" + heads[1] + told + b"\r\n--b--\r\n"
+
+    most_high = most_rows(MOST_POINTS) // MOST_WIDE
+    counts = np.random.default_rng(2).integers(500, 1500, (most_high, MOST_WIDE), dtype=np.uint16)
     return {
+        "a PNG of the most pixels": (form, lambda: depth(_png(counts))),
+        "an .npy of the most pixels, in metres": (form, lambda: depth(_npy(counts.astype(np.float32) / 1000))),
         "JSON of the most points": (
             "application/json",
             lambda: b'{"points": [' + b",".join([triples] * MOST_POINTS) + b"]}",
@@ -159,12 +182,30 @@ def bodies() -> Mapping[str, tuple[str, Callable[[], bytes]]]:
     }
 
 
+def _png(counts: Array) -> bytes:
+    file = io.BytesIO()
+    Image.fromarray(counts).save(file, "PNG", compress_level=1)
+    return file.getvalue()
+
+
+def _npy(array: Array) -> bytes:
+    file = io.BytesIO()
+    np.save(file, array)
+    return file.getvalue()
+
+
+def _memory_now() -> float:
+    """MB that this process holds, from which its peak is counted from now on (proc_pid_clear_refs(5))."""
+    Path("/proc/self/clear_refs").write_text("5")
+    return memory_mb(os.getpid(), "VmHWM")
+
+
 def measure(name: str, weights: Path) -> dict[str, float]:
     """Seconds and MB of one case, in this process."""
     if name in bodies():
         content_type, make = bodies()[name]
         body = bytearray(make())
-        before, started = memory_mb(os.getpid(), "VmHWM"), time.perf_counter()
+        before, started = _memory_now(), time.perf_counter()
         with contextlib.suppress(ServiceError, TesnetError):
             decoder_for(content_type)(body, MOST_POINTS)
         return {"seconds": time.perf_counter() - started, "mb": memory_mb(os.getpid(), "VmHWM") - before}
@@ -176,7 +217,7 @@ def measure(name: str, weights: Path) -> dict[str, float]:
         looks.append(time.perf_counter())
         return False
 
-    before, looks[0] = memory_mb(os.getpid(), "VmHWM"), time.perf_counter()
+    before, looks[0] = _memory_now(), time.perf_counter()
     predictor.predict(asked, give_up)
     looks.append(time.perf_counter())
     return {

@@ -6,8 +6,9 @@ cloud's canonical frame, which moves with the cloud; grid and order of the point
 
 from __future__ import annotations
 
-from collections.abc import Callable
+from collections.abc import Callable, Iterable
 from dataclasses import dataclass
+from itertools import chain
 
 import numpy as np
 import torch
@@ -57,6 +58,8 @@ _COLUMN, _LEAST_HIGH = 0.0135, 0.1
 """Edge of the squares of a support in which so large a share of the points is over its noise where things are."""
 _NEAR_SUPPORT = 0.03
 
+_ROWS_AT_ONCE = 1_000_000
+"""That are in memory in double precision."""
 MOST_ON_SUPPORT = 4_000
 """Of what stands on a support that was found, so many prepared points, the nearest to the camera: enough for any grasp,
 in twice the time of a tabletop scene of 30 cm."""
@@ -171,7 +174,8 @@ def prepare(
         things = sought & torch.from_numpy(region(posted[:, :3].cpu().numpy(), support)).to(device)
         on_things = int(things.sum()) >= MINIMUM_POINTS
         sought = things if on_things else sought
-    table = posted[sought]
+    table, outside = posted[sought], posted[~sought, :3]
+    del posted  # of the largest images a tenth of a gigabyte
     if len(table) == 0:
         return None
     between()
@@ -199,7 +203,7 @@ def prepare(
         kept = _within_limit(table[:, :3], viewpoints[0], min(config.max_points, MOST_ON_SUPPORT))
     else:
         kept = _within_limit(table[:, :3], _middle(query, table, on_target, T_cloud_canonical), config.max_points)
-    others = torch.cat([to_canonical(posted[~sought, :3]), table[~kept, :3]])
+    surplus = table[~kept, :3]
     table, on_target = table[kept], None if on_target is None else on_target[kept]
     outward = None if _outward(query) is None else table[:, -3:] @ torch.tensor(T_cloud_canonical.rotation).to(table)
     points = table[:, :3].contiguous()
@@ -229,7 +233,13 @@ def prepare(
         sides=_sides(query, T_cloud_canonical).to(device),
         T_cloud_canonical=T_cloud_canonical,
         on_target=on_target,
-        unsought=_unsought(points, others, config.voxel_size, a_cell),
+        unsought=_unsought(
+            points,
+            chain(map(to_canonical, outside.split(_ROWS_AT_ONCE)), [surplus]),
+            config.voxel_size,
+            a_cell,
+            between,
+        ),
         dropped_far=dropped_far,
         dropped_surplus=int((~kept).sum()),
         support_error=0.0 if support is None else support.noise_sd,
@@ -323,7 +333,7 @@ def _columns(query: GraspQuery) -> Tensor:
     outward = _outward(query)
     if outward is not None:
         columns.append(outward)
-    return torch.cat(columns, dim=1)
+    return torch.cat(columns, dim=1) if len(columns) > 1 else columns[0]
 
 
 def _outward(query: GraspQuery) -> Tensor | None:
@@ -398,20 +408,36 @@ def _within_limit(points: Tensor, middle: Tensor, limit: int) -> Tensor:
     return kept
 
 
-def _unsought(points: Tensor, others: Tensor, voxel_size: float, a_cell: float) -> Obstacles | None:
-    """The cells of the other points that a hand at the points may meet, but none of isolated points (flying pixels).
+def _unsought(
+    points: Tensor,
+    blocks: Iterable[Tensor],
+    voxel_size: float,
+    a_cell: float,
+    between: Callable[[], None] = lambda: None,
+) -> Obstacles | None:
+    """The cells of other points that a hand at the points may meet, but none of isolated points (flying pixels).
 
     Isolated are those whose surroundings, a cube of `_SURROUNDINGS` cells' edge, hold fewer than `_FEWEST_TOGETHER`
     points, or under a tenth of what a surface that crosses it holds where there are `a_cell` points in a cell.
     """
-    near = in_box(others, points.amin(dim=0) - _LONGEST_HAND, points.amax(dim=0) + _LONGEST_HAND)
-    others = others[near]
+    low, high = points.amin(dim=0) - _LONGEST_HAND, points.amax(dim=0) + _LONGEST_HAND
+    others = _near(blocks, low, high, between)
     if len(others) == 0:
         return None
-    surroundings, counts = members_of_cells((others / (_SURROUNDINGS * voxel_size)).floor().long())
     least = min(_FEWEST_TOGETHER, 0.1 * _SURROUNDINGS**2 * a_cell)
-    others = others[counts[surroundings] >= least]
-    return Obstacles.of(voxel_downsample(others, voxel_size)) if len(others) else None
+    surroundings, counts = members_of_cells(others, _SURROUNDINGS * voxel_size, between=between)
+    others = others[(counts >= least)[surroundings]]
+    del surroundings
+    return Obstacles.of(voxel_downsample(others, voxel_size, between)) if len(others) else None
+
+
+def _near(blocks: Iterable[Tensor], low: Tensor, high: Tensor, between: Callable[[], None]) -> Tensor:
+    """Those points (N, 3) of the blocks that lie between two corners (3,)."""
+    near = []
+    for block in blocks:
+        between()
+        near.append(block[in_box(block, low, high)])
+    return torch.cat(near)
 
 
 def _inside(points: Tensor, box: Box) -> Tensor:
@@ -423,7 +449,11 @@ def _inside(points: Tensor, box: Box) -> Tensor:
 def in_canonical_frame(points: Tensor, T_cloud_canonical: Pose) -> Tensor:
     """Points (N, 3) of the query's frame in the canonical one."""
     rotation = torch.tensor(T_cloud_canonical.rotation, device=points.device)
-    return ((points.double() - torch.tensor(T_cloud_canonical.translation, device=points.device)) @ rotation).float()
+    translation = torch.tensor(T_cloud_canonical.translation, device=points.device)
+    moved = torch.empty(points.shape, device=points.device)
+    for block, to in zip(points.split(_ROWS_AT_ONCE), moved.split(_ROWS_AT_ONCE), strict=True):
+        to.copy_((block.double() - translation) @ rotation)
+    return moved
 
 
 def canonical_frame(points: Tensor, viewpoints: Tensor, up: Tensor | None) -> Pose:

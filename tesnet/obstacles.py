@@ -45,7 +45,7 @@ class Obstacles:
         if len(points) == 0:
             none = torch.zeros(0, dtype=torch.long, device=points.device)
             return cls(points, none, none, points, points.new_zeros(0))
-        block, count = members_of_cells((points / BLOCK_SIZE).floor().long())
+        block, count = members_of_cells(points, BLOCK_SIZE)
         order = block.argsort(stable=True)
         points, block = points[order], block[order]
         low = points.new_zeros(len(count), 3).scatter_reduce(

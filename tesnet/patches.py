@@ -53,9 +53,9 @@ def group(cloud: PreparedCloud, size: float) -> Patches:
     Half a cell of shift keeps the point that the axes go through off every border.
     """
     axes = sight_axes(cloud.points, cloud.viewpoints[0])
-    cells = ((cloud.points - cloud.points.mean(dim=0)) @ axes / size + 0.5).floor().long()
-    member_of, counts = members_of_cells(cells)
-    sums = torch.zeros(len(counts), 9, device=cells.device)
+    along_axes = (cloud.points - cloud.points.mean(dim=0)) @ axes
+    member_of, counts = members_of_cells(along_axes, size, shift=0.5)
+    sums = torch.zeros(len(counts), 9, device=member_of.device)
     sums.index_add_(0, member_of, torch.cat([cloud.points, cloud.normals, cloud.view_directions], dim=1))
     points, normals, view_directions = (sums / counts[:, None]).split(3, dim=1)
     return Patches(

@@ -5,6 +5,7 @@ Knows no query, no candidate and no hand. Vectorised torch on the device of its 
 
 from __future__ import annotations
 
+import math
 from collections.abc import Callable, Iterator
 
 import numpy as np
@@ -15,6 +16,10 @@ from torch import Tensor
 _QUERIES_AT_ONCE = 1_000
 """Neighbours of so many are looked for in one or two milliseconds, in which no other Python thread runs."""
 
+_ROWS_AT_ONCE = 500_000
+_CELLS_COUNTED = 16_000_000
+"""Of a grid of so many, all are counted; of a larger one, or one of few points, those that are occupied are sorted."""
+
 _SLAB_QUERIES, _STRIP_QUERIES = 768, 128
 
 _NEARLY_FARTHEST = 0.7
@@ -24,21 +29,22 @@ _LARGEST_TABLE = 4_000_000
 """Distances that are in memory at a time, at most."""
 
 
-def voxel_downsample(points: Tensor, voxel_size: float) -> Tensor:
+def voxel_downsample(points: Tensor, voxel_size: float, between: Callable[[], None] = lambda: None) -> Tensor:
     """The mean of the rows (N, 3 or more), which begin with x, y, z, in every occupied cell, in the order of the cells.
 
     The grid's corner lies half a cell below the smallest coordinates, as in Open3D.
     """
-    return cells_of(points, voxel_size)[0]
+    return cells_of(points, voxel_size, between)[0]
 
 
-def cells_of(points: Tensor, voxel_size: float) -> tuple[Tensor, Tensor]:
-    """The means of `voxel_downsample`, and how many rows each is of."""
+def cells_of(points: Tensor, voxel_size: float, between: Callable[[], None] = lambda: None) -> tuple[Tensor, Tensor]:
+    """The means of `voxel_downsample`, and how many rows each is of. `between` is called between blocks of rows."""
     corner = points[:, :3].min(dim=0).values
-    cells = ((points[:, :3] - corner) / voxel_size + 0.5).floor().long()
-    cell_of_point, counts = members_of_cells(cells)
+    member_of, counts = members_of_cells(points[:, :3], voxel_size, corner, shift=0.5, between=between)
     sums = torch.zeros(len(counts), points.shape[1], dtype=torch.float64, device=points.device)
-    sums.index_add_(0, cell_of_point, points.double())
+    for rows, members in zip(points.split(_ROWS_AT_ONCE), member_of.split(_ROWS_AT_ONCE), strict=True):
+        between()
+        sums.index_add_(0, members, rows.double())
     return (sums / counts[:, None]).to(points.dtype), counts
 
 
@@ -50,13 +56,49 @@ def in_box(points: Tensor, low: Tensor, high: Tensor) -> Tensor:
     return inside
 
 
-def members_of_cells(cells: Tensor) -> tuple[Tensor, Tensor]:
-    """Of integer cells (P, 3): the number (P,) of each row among the occupied cells, in order, and their sizes."""
-    cells = cells - cells.min(dim=0).values
-    extent = cells.max(dim=0).values + 1
-    keys = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
-    _, member_of, counts = keys.unique(return_inverse=True, return_counts=True)
-    return member_of, counts
+def members_of_cells(
+    points: Tensor,
+    edge: float,
+    origin: Tensor | None = None,
+    *,
+    shift: float = 0.0,
+    between: Callable[[], None] = lambda: None,
+) -> tuple[Tensor, Tensor]:
+    """Of points (P, 3): the number (P,) of each one's cell among the occupied ones, in order, and their sizes.
+
+    Args:
+        points: at least one, of any frame.
+        edge: of the cells, metres.
+        origin: (3,) in the points' frame, unless it is theirs.
+        shift: how many cells below the origin a corner of one lies.
+        between: called between blocks of points.
+    """
+    origin = points.new_zeros(3) if origin is None else origin
+
+    def index(some: Tensor) -> Tensor:
+        found: Tensor = ((some - origin) / edge + shift).floor().long()
+        return found
+
+    first, last = index(torch.stack([points.amin(dim=0), points.amax(dim=0)]))
+    extent = last - first + 1
+
+    def keys(some: Tensor) -> Tensor:
+        cells = index(some) - first
+        numbers: Tensor = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
+        return numbers
+
+    blocks = points.split(_ROWS_AT_ONCE)
+    if math.prod(extent.tolist()) > min(_CELLS_COUNTED, 4 * len(points)):
+        _, member_of, counts = torch.cat([keys(block) for block in blocks]).unique(
+            return_inverse=True, return_counts=True
+        )
+        return member_of, counts
+    counts = torch.zeros(int(extent.prod()), dtype=torch.int32, device=points.device)
+    for block in blocks:
+        between()
+        counts.index_add_(0, keys(block), counts.new_ones(len(block)))
+    number = (counts > 0).cumsum(0, dtype=torch.int32) - 1
+    return torch.cat([number[keys(block)] for block in blocks]).long(), counts[counts > 0].long()
 
 
 def nearest_neighbours(

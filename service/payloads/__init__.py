@@ -18,7 +18,7 @@ from service.payloads.multipart_body import decode_multipart
 from service.payloads.npy_body import decode_npy
 from service.payloads.octets_body import decode_octet_stream
 from service.payloads.options import merged, parse_options, parse_query_string
-from service.payloads.payload import Payload, RawOptions
+from service.payloads.payload import Payload, RawOptions, most_rows
 
 __all__ = [
     "CONTENT_TYPES",
@@ -33,6 +33,7 @@ __all__ = [
     "decoder_for",
     "media_type",
     "merged",
+    "most_rows",
     "parse_options",
     "parse_query_string",
 ]

@@ -344,7 +344,7 @@ def test_what_is_not_sought_counts_where_it_does_not_stand_alone(a_cell: float, 
     sizes = range(1, 7)
     places = [[0.005, 0.005, 0.05 * size] for size in sizes]
     others = torch.tensor([place for place, size in zip(places, sizes, strict=True) for _ in range(size)])
-    found = cloud._unsought(torch.zeros(1, 3), others, 0.0045, a_cell)
+    found = cloud._unsought(torch.zeros(1, 3), [others], 0.0045, a_cell)
     assert found is not None
     heights = sorted(round(float(height), 3) for height in found.points[:, 2])
     assert heights == [round(0.05 * size, 3) for size in sizes if size >= fewest]
@@ -359,4 +359,4 @@ def test_what_is_not_sought_counts_as_far_as_a_hand_reaches(
     points = torch.tensor([[0.0, 0.0, 0.0], [0.1, 0.2, 0.3]])
     other = torch.tensor([0.05, 0.1, 0.15])
     other[axis] = (points[1, axis] + distance) if sign > 0 else -distance
-    assert (cloud._unsought(points, other.expand(5, 3), 0.0045, 10.0) is not None) == counts
+    assert (cloud._unsought(points, [other.expand(5, 3)], 0.0045, 10.0) is not None) == counts

@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import importlib
+import math
 from typing import Any
 
 import numpy as np
@@ -279,3 +280,19 @@ def test_a_strip_knows_every_point_near_its_queries(count: int, queries: int, ma
         assert set(near.nonzero()[:, 0].tolist()) <= set(around.tolist())
         seen += rows.tolist()
     assert sorted(seen) == list(range(queries))
+
+
+@pytest.mark.parametrize(("counted", "at_once"), [(0, 10**6), (10**7, 10**6), (10**7, 7), (0, 7)])
+def test_members_of_cells_are_those_of_a_loop_however_they_are_found(
+    monkeypatch: pytest.MonkeyPatch, counted: int, at_once: int
+) -> None:
+    monkeypatch.setattr(pts, "_CELLS_COUNTED", counted)
+    monkeypatch.setattr(pts, "_ROWS_AT_ONCE", at_once)
+    points = torch.from_numpy(np.random.default_rng(3).uniform(-0.02, 0.03, (200, 3))).float()
+    origin, asked = torch.tensor([0.001, -0.002, 0.0]), []
+    member_of, counts = pts.members_of_cells(points, 0.01, origin, shift=0.5, between=lambda: asked.append(1))
+    cells = [tuple(np.floor((point - origin.numpy()) / np.float32(0.01) + 0.5)) for point in points.numpy()]
+    occupied = sorted(set(cells))
+    assert member_of.tolist() == [occupied.index(cell) for cell in cells]
+    assert counts.tolist() == [cells.count(cell) for cell in occupied]
+    assert len(asked) == (0 if counted == 0 else math.ceil(200 / at_once))
