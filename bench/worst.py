@@ -24,12 +24,12 @@ from typing import Any, Literal, get_args, get_origin, get_type_hints
 
 import numpy as np
 from numpy.typing import NDArray
-from PIL import Image
 
 from bench import predict
 from bench.scene import five_objects
 from bench.serve import memory_mb
 from bench.table import processor
+from client.request import Intrinsics, depth_request
 from service.errors import ServiceError
 from service.payloads import decoder_for, most_rows
 from service.settings import Settings
@@ -146,9 +146,9 @@ def queries() -> Mapping[str, Callable[[], GraspQuery]]:
     return cases | {f"{cloud}, {EVERYTHING}": partial(with_option, cloud, EVERYTHING) for cloud in clouds()}
 
 
-def bodies() -> Mapping[str, tuple[str, Callable[[], bytes]]]:
-    """The bodies that take longest to decode, each with its content type."""
-    form = "multipart/form-data; boundary=b"
+def bodies() -> Mapping[str, Callable[[], tuple[str, bytes]]]:
+    """The bodies that take longest to decode, each with its content type before it."""
+    form, text = "multipart/form-data; boundary=b", "application/json"
     part = b'--b\r\nContent-Disposition: form-data; name="cloud"\r\n\r\n'
     triples = b"[0.123456,0.123456,1.123456]"
     ply = b"ply\nformat ascii 1.0\nelement vertex 9\nproperty float x\nproperty float y\nproperty float z\nend_header\n"
@@ -156,41 +156,30 @@ def bodies() -> Mapping[str, tuple[str, Callable[[], bytes]]]:
     def padded(start: bytes, fill: bytes, end: bytes = b"") -> bytes:
         return start + fill * ((MOST_BYTES - len(start) - len(end)) // len(fill)) + end
 
-    def depth(file: bytes) -> bytes:
-        """Of an image, of which the workspace keeps little."""
-        names = ("depth", "options")
-        camera = {"fx": 3000.0, "fy": 3000.0, "cx": MOST_WIDE / 2, "cy": most_high / 2}
-        corner = {"min": [-0.05, -0.05, 0.1], "max": [0.05, 0.05, 2.0]}
-        told = json.dumps({"intrinsics": camera, "workspace": corner}).encode()
-        heads = [f'--b\r\nContent-Disposition: form-data; name="{name}"\r\n\r\n'.encode() for name in names]
-        return heads[0] + file + b"\r\n" + heads[1] + told + b"\r\n--b--\r\n"
+    def image(sent: Callable[[Array], Array | bytes]) -> tuple[str, bytes]:
+        """Of the most pixels, of which the workspace keeps little; `sent` makes of their counts what is sent."""
+        width, height = MOST_WIDE, most_rows(MOST_POINTS) // MOST_WIDE
+        counts = np.random.default_rng(2).integers(500, 1500, (height, width), dtype=np.uint16)
+        camera: Intrinsics = {"fx": 3000.0, "fy": 3000.0, "cx": width / 2, "cy": height / 2}
+        workspace = {"min": [-0.05, -0.05, 0.1], "max": [0.05, 0.05, 2.0]}
+        request = depth_request(sent(counts), camera, {"workspace": workspace})
+        return request.headers["Content-Type"], request.content
 
-    most_high = most_rows(MOST_POINTS) // MOST_WIDE
-    counts = np.random.default_rng(2).integers(500, 1500, (most_high, MOST_WIDE), dtype=np.uint16)
     return {
-        "a PNG of the most pixels": (form, lambda: depth(_png(counts))),
-        "an .npy of the most pixels, in metres": (form, lambda: depth(_npy(counts.astype(np.float32) / 1000))),
-        "JSON of the most points": (
-            "application/json",
-            lambda: b'{"points": [' + b",".join([triples] * MOST_POINTS) + b"]}",
-        ),
-        "JSON of backslashes": ("application/json", lambda: padded(b'{"model": "', b"\\\\", b'"}')),
-        "JSON of quotes": ("application/json", lambda: padded(b'{"model": "', b'\\"', b'"}')),
-        "a PLY of blank lines": (form, lambda: padded(part + ply, b"\n", b"\r\n--b--\r\n")),
-        "a form with a long header": (form, lambda: padded(b"--b\r\nX: ", b"a")),
-        "bytes behind a form": (form, lambda: padded(part + b"\r\n--b--\r\n", b"a")),
+        "a PNG of the most pixels": lambda: image(lambda counts: counts),
+        "an .npy of the most pixels, in metres": lambda: image(_npy_in_metres),
+        "JSON of the most points": lambda: (text, b'{"points": [' + b",".join([triples] * MOST_POINTS) + b"]}"),
+        "JSON of backslashes": lambda: (text, padded(b'{"model": "', b"\\\\", b'"}')),
+        "JSON of quotes": lambda: (text, padded(b'{"model": "', b'\\"', b'"}')),
+        "a PLY of blank lines": lambda: (form, padded(part + ply, b"\n", b"\r\n--b--\r\n")),
+        "a form with a long header": lambda: (form, padded(b"--b\r\nX: ", b"a")),
+        "bytes behind a form": lambda: (form, padded(part + b"\r\n--b--\r\n", b"a")),
     }
 
 
-def _png(counts: Array) -> bytes:
+def _npy_in_metres(counts: Array) -> bytes:
     file = io.BytesIO()
-    Image.fromarray(counts).save(file, "PNG", compress_level=1)
-    return file.getvalue()
-
-
-def _npy(array: Array) -> bytes:
-    file = io.BytesIO()
-    np.save(file, array)
+    np.save(file, counts.astype(np.float32) / 1000)
     return file.getvalue()
 
 
@@ -203,8 +192,9 @@ def _memory_now() -> float:
 def measure(name: str, weights: Path) -> dict[str, float]:
     """Seconds and MB of one case, in this process."""
     if name in bodies():
-        content_type, make = bodies()[name]
-        body = bytearray(make())
+        content_type, content = bodies()[name]()
+        body = bytearray(content)
+        del content
         before, started = _memory_now(), time.perf_counter()
         with contextlib.suppress(ServiceError, TesnetError):
             decoder_for(content_type)(body, MOST_POINTS)

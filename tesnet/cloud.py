@@ -22,6 +22,7 @@ from tesnet.obstacles import Obstacles
 from tesnet.orientation import orient
 from tesnet.planes import basis, cells
 from tesnet.points import (
+    ROWS_AT_ONCE,
     drop_points,
     estimate_normals,
     in_box,
@@ -58,8 +59,6 @@ _COLUMN, _LEAST_HIGH = 0.0135, 0.1
 """Edge of the squares of a support in which so large a share of the points is over its noise where things are."""
 _NEAR_SUPPORT = 0.03
 
-_ROWS_AT_ONCE = 1_000_000
-"""That are in memory in double precision."""
 MOST_ON_SUPPORT = 4_000
 """Of what stands on a support that was found, so many prepared points, the nearest to the camera: enough for any grasp,
 in twice the time of a tabletop scene of 30 cm."""
@@ -235,7 +234,7 @@ def prepare(
         on_target=on_target,
         unsought=_unsought(
             points,
-            chain(map(to_canonical, outside.split(_ROWS_AT_ONCE)), [surplus]),
+            chain(map(to_canonical, outside.split(ROWS_AT_ONCE)), [surplus]),
             config.voxel_size,
             a_cell,
             between,
@@ -451,7 +450,7 @@ def in_canonical_frame(points: Tensor, T_cloud_canonical: Pose) -> Tensor:
     rotation = torch.tensor(T_cloud_canonical.rotation, device=points.device)
     translation = torch.tensor(T_cloud_canonical.translation, device=points.device)
     moved = torch.empty(points.shape, device=points.device)
-    for block, to in zip(points.split(_ROWS_AT_ONCE), moved.split(_ROWS_AT_ONCE), strict=True):
+    for block, to in zip(points.split(ROWS_AT_ONCE), moved.split(ROWS_AT_ONCE), strict=True):
         to.copy_((block.double() - translation) @ rotation)
     return moved
 

@@ -16,7 +16,8 @@ from torch import Tensor
 _QUERIES_AT_ONCE = 1_000
 """Neighbours of so many are looked for in one or two milliseconds, in which no other Python thread runs."""
 
-_ROWS_AT_ONCE = 500_000
+ROWS_AT_ONCE = 500_000
+"""Rows of a large cloud that are in memory in double precision, or counted, at a time: some tens of milliseconds."""
 _CELLS_COUNTED = 16_000_000
 """Of a grid of so many, all are counted; of a larger one, or one of few points, those that are occupied are sorted."""
 
@@ -42,7 +43,7 @@ def cells_of(points: Tensor, voxel_size: float, between: Callable[[], None] = la
     corner = points[:, :3].min(dim=0).values
     member_of, counts = members_of_cells(points[:, :3], voxel_size, corner, shift=0.5, between=between)
     sums = torch.zeros(len(counts), points.shape[1], dtype=torch.float64, device=points.device)
-    for rows, members in zip(points.split(_ROWS_AT_ONCE), member_of.split(_ROWS_AT_ONCE), strict=True):
+    for rows, members in zip(points.split(ROWS_AT_ONCE), member_of.split(ROWS_AT_ONCE), strict=True):
         between()
         sums.index_add_(0, members, rows.double())
     return (sums / counts[:, None]).to(points.dtype), counts
@@ -87,7 +88,7 @@ def members_of_cells(
         numbers: Tensor = (cells[:, 0] * extent[1] + cells[:, 1]) * extent[2] + cells[:, 2]
         return numbers
 
-    blocks = points.split(_ROWS_AT_ONCE)
+    blocks = points.split(ROWS_AT_ONCE)
     if math.prod(extent.tolist()) > min(_CELLS_COUNTED, 4 * len(points)):
         _, member_of, counts = torch.cat([keys(block) for block in blocks]).unique(
             return_inverse=True, return_counts=True

@@ -287,7 +287,7 @@ def test_members_of_cells_are_those_of_a_loop_however_they_are_found(
     monkeypatch: pytest.MonkeyPatch, counted: int, at_once: int
 ) -> None:
     monkeypatch.setattr(pts, "_CELLS_COUNTED", counted)
-    monkeypatch.setattr(pts, "_ROWS_AT_ONCE", at_once)
+    monkeypatch.setattr(pts, "ROWS_AT_ONCE", at_once)
     points = torch.from_numpy(np.random.default_rng(3).uniform(-0.02, 0.03, (200, 3))).float()
     origin, asked = torch.tensor([0.001, -0.002, 0.0]), []
     member_of, counts = pts.members_of_cells(points, 0.01, origin, shift=0.5, between=lambda: asked.append(1))
