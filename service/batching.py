@@ -2,7 +2,7 @@
 
 The predictor is made, warmed up and used in the worker's thread only. It predicts together what waits when it is free,
 up to a limit; it never waits for more to come. `service.turns` says whose turn it is. Between the stages of a
-prediction much cheaper ones have their turn, and one that nobody waits for is given up there: its deadline has passed,
+prediction cheaper ones have their turn, and one that nobody waits for is given up there: its deadline has passed,
 whoever waited for it has cancelled it, or the worker ends.
 """
 
@@ -328,6 +328,7 @@ class PredictionWorker:
             ended = self._running.pop()
             if started is not None:
                 self._costs.learn([job.query for job in ended.batch], now - started - ended.stolen, now)
+                self._turns.expect(partial(self._costs.expected, now=now))
 
     def _fail(self, predictor: Predictor, batch: list[Job], error: Exception) -> None:
         """Tell a job its error; those of a batch are tried each by itself, so that a query's fault is its own."""

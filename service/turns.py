@@ -11,7 +11,7 @@ from __future__ import annotations
 import math
 import time
 from collections import Counter
-from collections.abc import Hashable, Iterator
+from collections.abc import Callable, Hashable, Iterator
 from concurrent.futures import Future
 from dataclasses import dataclass, field
 
@@ -19,7 +19,10 @@ from tesnet.query import GraspQuery
 from tesnet.result import GraspResult
 
 MUCH_CHEAPER = 2
-"""Binary orders of magnitude in expected time by which a request may interrupt another, or have a spare place."""
+"""Binary orders of magnitude in expected time by which a request is cheaper than what waits, to have a spare place."""
+
+INTERRUPTED_FROM = 1.5
+"""How many times as long as another's a prediction should take for the other to interrupt it."""
 
 
 @dataclass(frozen=True, slots=True)
@@ -117,6 +120,11 @@ class Turns:
         mean = Job(job.query, self.expected / len(self._jobs))
         return len(self._jobs) < self.most and job.size + MUCH_CHEAPER <= mean.size
 
+    def expect(self, seconds: Callable[[GraspQuery], float]) -> None:
+        """Take what is now known of how long predictions take: two alike are of one size, whenever they came."""
+        for job in self._jobs:
+            job.expected = seconds(job.query)
+
     def ahead_of(self, job: Job) -> float:
         """Seconds that those should take whose turn is before the job's, were it to wait too."""
         return sum(other.expected for other in self._jobs if other.is_due or other.size <= job.size)
@@ -170,8 +178,8 @@ class Turns:
 
 
 def may_interrupt(job: Job, running: Job) -> bool:
-    """Whether a job is so much cheaper than one that runs."""
-    return job.size + MUCH_CHEAPER <= running.size
+    """Whether a job is so much cheaper than the one that runs that this one goes on only after it."""
+    return INTERRUPTED_FROM * job.expected <= running.expected
 
 
 def _size(job: Job) -> int:

@@ -366,7 +366,18 @@ def test_cheap_queries_pass_expensive_ones_and_one_another_in_order(busy: tuple[
     assert predictor.order == [0, 3, 4, 1, 2]
 
 
-def test_a_much_cheaper_query_has_its_turn_in_the_middle_of_an_expensive_one(
+def test_what_a_prediction_took_is_expected_of_those_that_wait(timed: tuple[Timed, PredictionWorker]) -> None:
+    """Not what was guessed when they came: two alike would be of different sizes, and the later one pass the other."""
+    predictor, worker = timed
+    jobs = [worker.submit(cloud_of(2000, seed)) for seed in range(3)]
+    guessed = jobs[2].expected
+    predictor.gate.release()
+    jobs[0].future.result(PATIENCE_S)
+    assert jobs[2].expected == pytest.approx(2.0)
+    assert guessed != pytest.approx(2.0)
+
+
+def test_a_cheaper_query_has_its_turn_in_the_middle_of_an_expensive_one(
     timed: tuple[Timed, PredictionWorker],
 ) -> None:
     predictor, worker = timed

@@ -9,7 +9,7 @@ import pytest
 from hypothesis import given
 from hypothesis import strategies as st
 
-from service.turns import Job, Turns
+from service.turns import INTERRUPTED_FROM, Job, Turns
 from tesnet.query import GraspQuery
 
 QUERY = GraspQuery(np.zeros((4, 3), np.float32))
@@ -110,7 +110,7 @@ def test_a_cheap_one_may_interrupt_a_dear_one_while_nobody_is_due() -> None:
     running = job(8.0)
     turns.add(running, busy=0.0)
     assert turns.take() is running
-    turns.add(job(4.0), busy=8.0)
+    turns.add(job(8.0 / INTERRUPTED_FROM + 0.1), busy=8.0)
     assert turns.take_between(running) is None
     for _ in range(8):
         cheap = job(1.0)
@@ -118,6 +118,23 @@ def test_a_cheap_one_may_interrupt_a_dear_one_while_nobody_is_due() -> None:
         assert turns.take_between(running) is cheap
     turns.add(job(1.0), busy=8.0)
     assert turns.take_between(running) is None  # the one that runs is due
+
+
+def test_half_as_dear_is_cheap_enough_to_interrupt() -> None:
+    turns = Turns(places=8)
+    half = job(0.25)
+    turns.add(half, busy=0.5)
+    assert turns.take_between(job(0.5)) is half
+
+
+def test_two_alike_go_in_order_of_arrival_though_they_came_under_other_guesses() -> None:
+    turns = Turns(places=8)
+    early, cheap, late = job(1.14), Job(GraspQuery(np.zeros((5, 3), np.float32)), 0.8), job(0.5)
+    for one in (early, cheap, late):
+        turns.add(one, busy=0.0)
+    turns.expect(lambda query: {4: 0.5, 5: 0.2}[len(query.points)])
+    assert turns.expected == pytest.approx(1.2)
+    assert [turns.take() for _ in range(3)] == [cheap, early, late]
 
 
 def test_cheap_ones_have_spare_places_and_others_do_not() -> None:
