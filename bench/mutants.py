@@ -1,8 +1,8 @@
 """Small faults put into the code, one at a time, and which of them no test notices: `make mutants`.
 
 Cosmic Ray makes the faults: another operator, comparison or number, a negated condition, a `break` for a `continue`. A
-fault in `a/b.py` meets the tests of `a/b.py` alone, as CONTRIBUTING.md has it ("Where the test of a line is"). Faults
-are put into copies of the tree, never into the tree itself.
+fault in `a/b.py` meets the tests of `a/b.py`, as CONTRIBUTING.md has it ("Where the test of a line is"), and what they
+miss all tests of its package. Faults are put into copies of the tree, never into the tree itself.
 
 Ends with 0 where every fault was noticed or stands in `bench/harmless_mutants.json`, else with 1 and the list of the
 others, in that file's form, in `--out`.
@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Iterable, Iterator, Mapping, Sequence
+from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -101,13 +101,23 @@ def mirror_of(module: str, root: Path) -> tuple[str, ...]:
     return tuple(found.as_posix() for found in named if (root / found).is_file())
 
 
+def package_of(module: str) -> str:
+    """The one of `PACKAGES` that a module belongs to."""
+    return next(package for package in PACKAGES if module.startswith(f"{package}/"))
+
+
+def all_of_package(module: str, _: Path) -> tuple[str, ...]:
+    """The folder of all tests of a module's package."""
+    return (f"tests/{package_of(module)}",)
+
+
 def places(source: str) -> list[list[Change]]:
     """For each place of a module where something can be changed, every change of it, in the order of the file.
 
-    Annotations are no such places: nothing evaluates them.
+    Annotations and the options of dataclasses are no such places: the type checker holds them.
     """
     nodes = list(ast_nodes(get_ast(source)))
-    quiet = list(_annotations(source))
+    quiet = [span for node in _checked(ast.parse(source)) if (span := _span(node)) is not None]
     found: dict[Span, list[Change]] = defaultdict(list)
     for name in filter(_is_plausible, operator_names()):
         kind = get_operator(name)
@@ -136,12 +146,19 @@ def mutant(module: str, source: str, change: Change) -> Mutant | None:
     return Mutant(module, line, before[line - 1].strip(), " ".join(map(str.strip, after[line - 1 : end])), code)
 
 
-def _annotations(source: str) -> Iterator[Span]:
-    for node in ast.walk(ast.parse(source)):
-        noted = getattr(node, "annotation", None), getattr(node, "returns", None)
-        for found in noted:
-            if isinstance(found, ast.expr) and found.end_lineno is not None and found.end_col_offset is not None:
-                yield (found.lineno, found.col_offset), (found.end_lineno, found.end_col_offset)
+def _checked(tree: ast.Module) -> Iterator[ast.AST | None]:
+    """What the type checker holds, and tests need not."""
+    for node in ast.walk(tree):
+        yield getattr(node, "annotation", None)
+        yield getattr(node, "returns", None)
+        if isinstance(node, ast.ClassDef):
+            yield from (call for call in node.decorator_list if isinstance(call, ast.Call))
+
+
+def _span(node: ast.AST | None) -> Span | None:
+    if isinstance(node, ast.expr) and node.end_lineno is not None and node.end_col_offset is not None:
+        return (node.lineno, node.col_offset), (node.end_lineno, node.end_col_offset)
+    return None
 
 
 def sample(package: str, count: int, seed: int, root: Path) -> list[Mutant]:
@@ -189,14 +206,14 @@ class Laboratory:
             raise BrokenTests(f"{' '.join(tests)}: do not pass as they are (pytest ends with {code}); mend them first")
         return time.perf_counter() - began
 
-    def notices(self, mutant: Mutant, limit_s: float) -> bool:
-        """Whether the tests of a fault's module fail, or take longer than the limit."""
+    def notice(self, mutant: Mutant, tests: Sequence[str], limit_s: float) -> bool:
+        """Whether tests fail with a fault, or take longer than the limit."""
         with self._copy() as copy:
             path = copy / mutant.module
             whole = path.read_text(encoding="utf-8")
             path.write_text(mutant.code, encoding="utf-8")
             try:
-                code = _run(copy, mirror_of(mutant.module, ROOT), limit_s)
+                code = _run(copy, tests, limit_s)
             finally:
                 path.write_text(whole, encoding="utf-8")
         assert code != NO_TESTS
@@ -236,21 +253,30 @@ def _run(copy: Path, tests: Sequence[str], limit_s: float | None) -> int | None:
         process.wait()
 
 
-def try_all(chosen: Sequence[Mutant], workers: int) -> list[Mutant]:
-    """The faults that no test noticed.
+def try_all(chosen: Sequence[Mutant], workers: int, harmless: Container[tuple[str, str, str]] = ()) -> list[Mutant]:
+    """The faults that no test noticed: none of their modules', and of those left none of their packages'.
+
+    Args:
+        chosen: what is tried.
+        workers: so many side by side.
+        harmless: keys of faults that the tests of their packages need not be tried on.
 
     Raises:
         BrokenTests: tests that do not pass without a fault.
     """
-    files = sorted({mirror_of(mutant.module, ROOT) for mutant in chosen})
     with Laboratory(workers) as laboratory, ThreadPoolExecutor(workers) as pool:
-        taken = dict(zip(files, pool.map(laboratory.seconds, files), strict=True))
 
-        def notices(mutant: Mutant) -> bool:
-            return laboratory.notices(mutant, limit(taken[mirror_of(mutant.module, ROOT)]))
+        def missed(mutants: Sequence[Mutant], tests_of: Callable[[str, Path], tuple[str, ...]]) -> list[Mutant]:
+            tests = [tests_of(mutant.module, ROOT) for mutant in mutants]
+            different = sorted(set(tests))
+            limits = dict(zip(different, map(limit, pool.map(laboratory.seconds, different)), strict=True))
+            tried = pool.map(laboratory.notice, mutants, tests, [limits[files] for files in tests])
+            noticed = list(tqdm(tried, total=len(mutants), unit="fault", file=sys.stderr))
+            return [mutant for mutant, seen in zip(mutants, noticed, strict=True) if not seen]
 
-        noticed = list(tqdm(pool.map(notices, chosen), total=len(chosen), unit="fault", file=sys.stderr))
-    return [mutant for mutant, seen in zip(chosen, noticed, strict=True) if not seen]
+        left = missed(chosen, mirror_of)
+        unknown = missed([mutant for mutant in left if mutant.key not in harmless], all_of_package)
+    return [mutant for mutant in left if mutant in unknown or mutant.key in harmless]
 
 
 def limit(seconds: float) -> float:
@@ -268,8 +294,8 @@ def table(chosen: Iterable[Mutant], survivors: Iterable[Mutant], harmless: Mappi
     rows = [f"{'':16}  {'faults':>7}  {'noticed':>7}  {'harmless':>8}  {'survived':>8}  {'%':>5}"]
     chosen, survivors = list(chosen), list(survivors)
     for package in PACKAGES:
-        tried = [mutant for mutant in chosen if mutant.module.startswith(package)]
-        left = [mutant for mutant in survivors if mutant.module.startswith(package)]
+        tried = [mutant for mutant in chosen if package_of(mutant.module) == package]
+        left = [mutant for mutant in survivors if package_of(mutant.module) == package]
         excused = sum(mutant.key in harmless for mutant in left)
         noticed = len(tried) - len(left)
         share = 100 * noticed / max(len(tried) - excused, 1)
@@ -296,12 +322,12 @@ def main(arguments: Sequence[str] | None = None) -> int:
     add("--out", type=Path, default=Path("mutants-report"), metavar="DIR", help="where the list goes")
     options = parser.parse_args(arguments)
     chosen = [one for package in options.packages for one in sample(package, options.each, options.seed, ROOT)]
+    harmless = known_harmless((ROOT / HARMLESS).read_text(encoding="utf-8"))
     try:
-        survivors = try_all(chosen, options.workers)
+        survivors = try_all(chosen, options.workers, harmless)
     except BrokenTests as error:
         print(f"mutants: {error}", file=sys.stderr)
         return 2
-    harmless = known_harmless((ROOT / HARMLESS).read_text(encoding="utf-8"))
     new = [mutant for mutant in survivors if mutant.key not in harmless]
     options.out.mkdir(parents=True, exist_ok=True)
     (options.out / SURVIVORS).write_text(as_json(new), encoding="utf-8")

@@ -21,6 +21,7 @@ from bench.mutants import (
     places,
     sample,
     table,
+    try_all,
 )
 
 SOURCE = """from __future__ import annotations
@@ -73,6 +74,12 @@ def test_every_fault_is_one_change_of_code_that_runs() -> None:
         assert changed[0][0].strip() == fault.before
 
 
+def test_options_of_dataclasses_are_left_alone() -> None:
+    source = "@dataclass(frozen=True)\nclass A:\n    b: int = 1\n"
+    assert {fault.line for fault in all_mutants(source)} <= {1, 3}
+    assert not any("False" in fault.after for fault in all_mutants(source))
+
+
 def test_annotations_are_left_alone_and_so_are_bits_where_there_are_none() -> None:
     afters = [fault.after for fault in all_mutants(SOURCE)]
     assert all("float | None" in after for after in afters if "float" in after)
@@ -108,13 +115,24 @@ def test_a_fault_is_noticed_by_a_test_that_fails_or_does_not_end_and_the_tree_st
         return Mutant("a/b.py", 1, "", "", code)
 
     with Laboratory(1) as laboratory:
-        assert laboratory.seconds(["tests/a/test_b.py"]) > 0
-        assert laboratory.notices(fault("one = 0\ntwo = 2\n"), limit(0))
-        assert not laboratory.notices(fault("one = 1\ntwo = 3\n"), limit(0))
-        assert laboratory.notices(fault("one = 2\ntwo = 2\n"), limit_s=5)
-        assert laboratory.notices(fault("one = \n"), limit(0))
+        tests = ["tests/a/test_b.py"]
+        assert laboratory.seconds(tests) > 0
+        assert laboratory.notice(fault("one = 0\ntwo = 2\n"), tests, limit(0))
+        assert not laboratory.notice(fault("one = 1\ntwo = 3\n"), tests, limit(0))
+        assert laboratory.notice(fault("one = 2\ntwo = 2\n"), tests, limit_s=5)
+        assert laboratory.notice(fault("one = \n"), tests, limit(0))
         assert laboratory.seconds(["tests/a/test_b.py"]) > 0
     assert (tree / "a" / "b.py").read_text() == "one = 1\ntwo = 2\n"
+
+
+def test_what_a_modules_own_tests_miss_meets_those_of_its_package(tree: Path, monkeypatch: pytest.MonkeyPatch) -> None:
+    (tree / "tests" / "a" / "test_c.py").write_text("from a.b import two\n\ndef test_two():\n    assert two < 4\n")
+    monkeypatch.setattr("bench.mutants.PACKAGES", ("a",))
+    monkeypatch.setattr("bench.mutants._tracked", lambda: ["a/b.py", "tests/a/test_b.py", "tests/a/test_c.py"])
+    values = ((0, 2), (1, 4), (1, 3), (1, 5))
+    faults = [Mutant("a/b.py", 2, "", f"{one}, {two}", f"one = {one}\ntwo = {two}\n") for one, two in values]
+    assert try_all(faults, workers=2) == faults[2:3]
+    assert try_all(faults, workers=2, harmless=[fault.key for fault in faults]) == faults[1:]
 
 
 def test_tests_that_fail_without_a_fault_are_told(tree: Path) -> None:

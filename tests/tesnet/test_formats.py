@@ -377,6 +377,16 @@ def sized(packed: int, size: int) -> bytes:
     return packed.to_bytes(4, "little") + size.to_bytes(4, "little")
 
 
+def test_of_a_long_header_the_message_gives_eighty_characters() -> None:
+    with pytest.raises(UnreadableFile) as refused:
+        read_npy(npy_header((-1,) * 60))
+    shown = str(refused.value).partition("negative size: ")[2].partition("; save")[0]
+    assert len(shown) == 80
+    assert shown.endswith("...")
+    with pytest.raises(UnreadableFile, match=r"negative size: \(-1, 3\); save"):
+        read_npy(npy_header((-1, 3)))
+
+
 def npy_header(shape: tuple[int, ...], descr: str = "<f4") -> bytes:
     text_of_header = f"{{'descr': {descr!r}, 'fortran_order': False, 'shape': {shape!r}}}\n".encode()
     return b"\x93NUMPY\x01\x00" + len(text_of_header).to_bytes(2, "little") + text_of_header

@@ -133,6 +133,10 @@ def test_a_comparison_keeps_the_last_epoch_and_measures_all_candidates(
     assert PRESETS["comparison"].blocked_per_view > 0
 
 
+def test_every_recipe_begins_with_a_rate_that_adam_can_learn_at() -> None:
+    assert all(1e-4 <= recipe.learning_rate <= 1e-2 for recipe in PRESETS.values())
+
+
 @pytest.mark.parametrize("stopped", [False, True])
 @pytest.mark.parametrize(("keep", "epoch"), [("best", 2), ("last", 4)])
 def test_the_weights_kept_are_those_of_the_epoch_they_are_named_after(

@@ -86,6 +86,15 @@ def test_calibration_recovers_the_slope_and_offset_that_made_the_outcomes() -> N
     assert (a, b) == pytest.approx((0.7, -2.0), abs=0.05)
 
 
+def test_calibration_ends_where_the_loss_falls_no_further_however_rare_successes_are() -> None:
+    rng = np.random.default_rng(1)
+    logits = rng.normal(-1, 3, 5_000)
+    success = rng.random(5_000) < 1 / (1 + np.exp(-(2.0 * logits - 9)))
+    a, b = metrics.fit_calibration(logits, success)
+    residual = 1 / (1 + np.exp(-(a * logits + b))) - success
+    assert np.abs([residual @ logits, residual.sum()]).max() < 1e-3
+
+
 @given(view=scored(), scale=st.sampled_from([0.01, 1.0, 30.0]))
 @FEW
 def test_calibration_never_makes_the_loss_worse(view: tuple[Logits, Success], scale: float) -> None:

@@ -12,7 +12,7 @@ from simharness.sim.scene import TABLE_HEIGHT, WORKSPACE, restore_scene
 from simharness.sim.sensors.catalogue import SENSORS
 from simharness.sim.world import World, data_path
 from tesnet.hands import HANDS
-from training.viewing import SHOWS, Shows, Viewing, draw_viewing, sensor_of
+from training.viewing import SHOWS, MoreViews, Shows, Viewing, draw_viewing, sensor_of
 
 pytestmark = pytest.mark.sim
 MIDDLE = np.array([0.15, 0.15, 0.05])
@@ -20,6 +20,12 @@ MIDDLE = np.array([0.15, 0.15, 0.05])
 
 def drawn(count: int = 400) -> list[Viewing]:
     return [draw_viewing("any", "random", np.random.default_rng(seed)) for seed in range(count)]
+
+
+def test_labels_are_shown_from_as_many_new_cameras_as_asked_for_and_by_default_none() -> None:
+    rng = np.random.default_rng(0)
+    assert MoreViews().draw(rng) == []
+    assert len(MoreViews(3, "any", "random").draw(rng)) == 3
 
 
 def test_views_come_from_everywhere() -> None:

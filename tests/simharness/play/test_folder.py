@@ -34,6 +34,14 @@ def test_rounds_come_back_as_they_were_written(tmp_path: Path, make_settings: An
     assert folder.read_run() == (make_settings(), MODEL, SERVING)
 
 
+def test_what_is_no_json_is_refused_and_leaves_the_file_as_it_was(tmp_path: Path) -> None:
+    folder = RunFolder(tmp_path)
+    folder.write_json("a.json", {"rate": 0.5})
+    with pytest.raises(ValueError, match="JSON"):
+        folder.write_json("a.json", {"rate": float("nan")})
+    assert json.loads((tmp_path / "a.json").read_text()) == {"rate": 0.5}
+
+
 def test_a_round_that_a_crash_cut_short_is_played_again(tmp_path: Path, make_settings: Any, run: Run) -> None:
     folder = RunFolder(tmp_path)
     folder.prepare(make_settings(), resume=False)

@@ -43,6 +43,22 @@ def test_the_cloud_picture_shows_points_and_hand() -> None:
     assert (picture == (100, 100, 100)).all(axis=2).any()
 
 
+def test_the_cloud_picture_holds_all_points_and_is_as_large_as_they_allow() -> None:
+    points = np.array([[x, y, 0.1] for x in (0.0, 0.3) for y in (0.0, 0.3)], dtype=np.float32)
+    colours = np.array([[200, 0, 0], [0, 200, 0], [0, 0, 200], [200, 200, 0]], dtype=np.uint8)
+    pose = Pose.from_quaternion([1.0, 0.0, 0.0, 0.0], [0.15, 0.15, 0.15]).matrix
+    image = cloud_picture(points, colours, pose, 0.08, (220, 38, 38), np.array([0.15, -0.4, 0.5]))
+    picture = np.asarray(image).astype(int)
+    places = []
+    for colour in colours:
+        lit = colour > 0
+        seen = (picture[..., lit] > 100).all(axis=2) & (picture[..., ~lit] < 5).all(axis=2)
+        assert seen.any(), colour
+        places.append(np.argwhere(seen).mean(axis=0))
+    across = np.ptp(places, axis=0) / picture.shape[:2]
+    assert 0.6 < across.max() < 1.0
+
+
 def test_an_empty_cloud_gives_a_picture_too() -> None:
     nothing = np.empty((0, 3))
     picture = cloud_picture(

@@ -38,6 +38,14 @@ def test_a_pose_of_another_shape_is_refused(make_round: Any) -> None:
         replace(attempt, T_world_grasp=np.eye(3))
 
 
+def test_an_attempt_is_corrected_where_the_service_says_so(make_round: Any) -> None:
+    attempt = make_round(0, 0, ["slip"]).attempts[0]
+    corrected = "calibrate: depth is multiplied by 1.010"
+    warnings = {(): False, ("depth is multiplied by 2",): False, ("x", corrected): True, ("calibrate: nothing",): False}
+    for said, expected in warnings.items():
+        assert replace(attempt, warnings=said).corrected is expected, said
+
+
 def test_only_a_success_is_one(make_round: Any) -> None:
     kinds = ["success", "pregrasp", "approach", "slip", "drop"]
     assert [attempt.success for attempt in make_round(0, 0, kinds).attempts] == [True, False, False, False, False]

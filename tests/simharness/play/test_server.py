@@ -10,6 +10,7 @@ import httpx
 import pytest
 
 from simharness.errors import RunBroken
+from simharness.play import server
 from simharness.play.server import LocalService, free_port
 from tests.simharness.commands import wait_for
 
@@ -52,6 +53,20 @@ def test_the_service_ends_when_the_harness_is_killed(stub_command: tuple[str, ..
         return False
 
     wait_for(gone, "the service to end")
+
+
+def test_a_service_that_does_not_end_is_killed(
+    stub_command: tuple[str, ...], tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    monkeypatch.setattr(server, "STOPPED_WITHIN_S", 0.5)
+    deaf = (
+        "import runpy, signal; signal.signal(signal.SIGTERM, signal.SIG_IGN); "
+        f"runpy.run_path({stub_command[1]!r}, run_name='__main__')"
+    )
+    with LocalService("tesnet", tmp_path / "log", (stub_command[0], "-c", deaf)) as service:
+        assert httpx.get(service.url + "/model", trust_env=False).status_code == 200
+    assert service.died is not None
+    assert "signal 9" in service.died
 
 
 def test_another_port_is_tried_when_one_was_taken_meanwhile(

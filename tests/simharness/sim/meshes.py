@@ -2,6 +2,9 @@
 
 from __future__ import annotations
 
+import hashlib
+from collections.abc import Iterable
+
 import numpy as np
 
 from simharness.sim.solids import Array, GeneratedObject, Mesh
@@ -67,3 +70,14 @@ def assert_centred_on_its_mass(generated: GeneratedObject) -> None:
     weights = [part.volume * body.density for body in generated.bodies for part in body.parts]
     centre = np.average([part.centroid for part in parts_of(generated)], axis=0, weights=weights)
     np.testing.assert_allclose(centre, 0, atol=1e-9, err_msg=generated.name)
+
+
+def digest_of(objects: Iterable[GeneratedObject]) -> str:
+    """SHA-256 of every mesh and convex part, to 10 micrometres."""
+    digest = hashlib.sha256()
+    for generated in objects:
+        digest.update(generated.name.encode())
+        for mesh in meshes_of(generated):
+            digest.update((np.round(mesh.vertices * 1e5) + 0.0).astype("<f8").tobytes())
+            digest.update(mesh.faces.astype("<i8").tobytes())
+    return digest.hexdigest()

@@ -30,11 +30,15 @@ from simharness.sim.sensors.catalogue import SENSORS
 from simharness.sim.sensors.gaussian import DepthGaussian
 from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.world import World
-from tesnet.geometry import Pose
+from tesnet.geometry import CameraIntrinsics, Pose
 
 pytestmark = pytest.mark.sim
 
 TOP = TABLE_HEIGHT + 0.08
+
+
+def test_the_camera_is_the_protocols() -> None:
+    assert CameraIntrinsics(width=640, height=480, fx=540.0, fy=540.0, cx=320.0, cy=240.0) == INTRINSICS
 
 
 @pytest.fixture

@@ -101,6 +101,16 @@ def test_a_mesh_that_a_urdf_refers_to_is_not_an_object_of_its_own(tmp_path: Path
     assert all(model.scale_hint == 1.0 and model.urdf.is_file() for model in models)
 
 
+@pytest.mark.parametrize(
+    "mesh", ["package://things/meshes/can.obj", "package://meshes/can.obj", "file://{folder}/meshes/can.obj"]
+)
+def test_the_mesh_of_a_uri_is_found_where_the_simulator_finds_it(tmp_path: Path, mesh: str) -> None:
+    folder = tmp_path / "things"
+    urdf = add_cube(folder, "can")
+    urdf.write_text(URDF.format(mesh=mesh.format(folder=folder), scale=0.05))
+    assert load_object_set(str(folder), "pile") == (ObjectModel("can", urdf),)
+
+
 def test_a_urdf_wins_over_a_bare_mesh_of_the_same_name(tmp_path: Path) -> None:
     urdf = add_cube(tmp_path, "can")
     add_bare(tmp_path, "can")

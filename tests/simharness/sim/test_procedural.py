@@ -5,7 +5,7 @@ from __future__ import annotations
 import numpy as np
 import pytest
 
-from simharness.sim.procedural import FAMILIES, OBJECTS_PER_FAMILY, generate_object, object_names
+from simharness.sim.procedural import FAMILIES, OBJECTS_PER_FAMILY, Split, generate_object, object_names
 from simharness.sim.solids import GeneratedObject
 from tests.simharness.sim.meshes import (
     assert_centred_on_its_mass,
@@ -14,11 +14,24 @@ from tests.simharness.sim.meshes import (
     assert_seen_is_touched,
     assert_stands,
     corners_of,
+    digest_of,
     parts_of,
     shells_of,
 )
 
 NAMES = [*object_names("test"), *(name for name in object_names("train") if name.endswith(("_00", "_05")))]
+
+
+DIGESTS: dict[Split, str] = {
+    "test": "e04025135717dd6c092b356ecefb355a6000d09299af03724c2745f2f25f1fb2",
+    "train": "91a3ef8803f7ebc5c2afa4554e04b4ebb22de8c6fc12dc318889b28a37e4d164",
+}
+"""Labels and rates are useless without their objects."""
+
+
+@pytest.mark.parametrize("split", DIGESTS)
+def test_objects_are_those_that_labels_and_rates_were_made_with(split: Split) -> None:
+    assert digest_of(map(generate_object, object_names(split))) == DIGESTS[split]
 
 
 @pytest.fixture(scope="module")

@@ -7,7 +7,8 @@ import numpy.typing as npt
 import pytest
 
 from simharness.sim.sensors.calibration import Calibration
-from simharness.sim.sensors.catalogue import SENSORS, SensorName, random_sensor
+from simharness.sim.sensors.catalogue import D415, D435, SENSORS, SensorName, random_sensor
+from simharness.sim.sensors.stereo import Stereo
 from simharness.sim.sensors.structured_light import Redwood, SimKinect
 from tesnet.geometry import CameraIntrinsics
 
@@ -28,6 +29,16 @@ def test_a_sensor_keeps_most_of_a_scene_within_a_few_percent_and_invents_nothing
     assert np.abs(np.median(error[measured[190:290, 275:360] > 0])) < 0.06
     again = SENSORS[name].measure(scene, camera, np.random.default_rng(1))
     np.testing.assert_array_equal(measured, again)
+
+
+@pytest.mark.parametrize(
+    ("stereo", "width", "field_deg", "baseline"), [(D435, 848, 90.0, 0.05), (D415, 1280, 65.0, 0.055)]
+)
+def test_a_stereo_camera_has_the_focal_length_of_its_width_and_field_of_view(
+    stereo: Stereo, width: int, field_deg: float, baseline: float
+) -> None:
+    assert stereo.focal_length == pytest.approx(width / 2 / np.tan(np.deg2rad(field_deg) / 2), abs=0.1)
+    assert stereo.baseline == baseline
 
 
 def test_training_sensors_differ_and_have_no_error_that_the_image_cannot_show() -> None:

@@ -7,6 +7,8 @@ from collections.abc import Callable
 import numpy as np
 import numpy.typing as npt
 import pytest
+from hypothesis import given
+from hypothesis import strategies as st
 
 from simharness.sim.sensors.losses import Dropout, FlyingPixels, cut_ellipse
 from tesnet.geometry import CameraIntrinsics
@@ -32,6 +34,18 @@ def test_an_ellipse_has_its_area_and_its_axes_at_whatever_angle(camera: CameraIn
         assert (rows.mean(), columns.mean()) == pytest.approx((200.0, 300.0), abs=0.1)
         along = (columns - 300) * np.cos(angle) + (rows - 200) * np.sin(angle)
         assert np.abs(along).max() == pytest.approx(20.0, abs=1.0)
+
+
+@given(row=st.integers(0, 29), column=st.integers(0, 39), angle=st.floats(0, 3.2), radius=st.floats(0.5, 50))
+def test_the_pixels_of_an_ellipse_are_those_within_it_wherever_it_lies(
+    row: int, column: int, angle: float, radius: float
+) -> None:
+    image = np.ones((30, 40))
+    cut_ellipse(image, row, column, np.array([radius, 4.0]), angle)
+    down, across = np.indices(image.shape) - np.array([row, column])[:, None, None]
+    turn = np.array([[np.cos(angle), np.sin(angle)], [-np.sin(angle), np.cos(angle)]])
+    along, beside = np.tensordot(turn, np.stack([across, down]), axes=1)
+    np.testing.assert_array_equal(image == 0, (along / radius) ** 2 + (beside / 4.0) ** 2 <= 1.0)
 
 
 def test_an_ellipse_at_the_border_is_cut_off_there(camera: CameraIntrinsics) -> None:
