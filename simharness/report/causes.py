@@ -36,7 +36,13 @@ Place = Literal[
     "behind something else",
     "beside everything seen",
 ]
-Closing = Literal["never closed", "nothing between the fingers", "touched on one side", "touched by both fingers"]
+Closing = Literal[
+    "never closed",
+    "nothing between the fingers",
+    "touched on one side",
+    "several things, none touched by both fingers",
+    "touched by both fingers",
+]
 
 SEEN_WITHIN = 0.004
 """Metres: a surface with an observed point so near was seen, one so far behind the image's depth was hidden."""
@@ -247,7 +253,9 @@ def _closing(grip: Grip | None) -> Closing:
         return "never closed"
     if grip.empty or not grip.touched:
         return "nothing between the fingers"
-    return "touched by both fingers" if grip.pinched else "touched on one side"
+    if grip.pinched:
+        return "touched by both fingers"
+    return "touched on one side" if len(grip.touched) == 1 else "several things, none touched by both fingers"
 
 
 def _sorted(found: Sequence[Failure]) -> list[tuple[tuple[str, str, str], list[Failure]]]:

@@ -80,6 +80,8 @@ def test_the_evidence_of_an_attempt_becomes_its_cause(seen: tuple[Observation, i
     for grip, closing in (
         (Grip(frozenset(), frozenset(), empty=True), "nothing between the fingers"),
         (Grip(frozenset({front}), frozenset(), empty=False), "touched on one side"),
+        (Grip(frozenset({front, 7}), frozenset(), empty=False), "several things, none touched by both fingers"),
+        (Grip(frozenset({front, 7}), frozenset({front}), empty=False), "touched by both fingers"),
         (Grip(frozenset({front}), frozenset({front}), empty=False), "touched by both fingers"),
     ):
         outcome = Outcome("slip", (), contact_at_start=False, contact_on_way=False, closed=grip)
