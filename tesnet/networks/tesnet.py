@@ -19,6 +19,7 @@ from tesnet.candidates import Candidates, at_rest
 from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.layers import PointTransformerConv, SAGEConv
 from tesnet.networks.around_hand import PROBES, PROBES_IN_FINGERS, Region, ends, probes, region_about
+from tesnet.networks.low_things import unevenness
 from tesnet.networks.network import mirror_factors
 from tesnet.networks.told import TOLD_INPUTS, told_inputs
 from tesnet.patches import Patches, group, pool
@@ -55,6 +56,8 @@ class TesNetConfig:
             is nothing, and so a network learns; on things wider than the hand there is.
         mirrored: of so many candidates of a call, the best, the logit is the mean of what the network makes of their
             surroundings and of these reflected in the hand's plane. Not in training, which shows either.
+        evenness: log odds that a candidate loses for low things of other heights between its fingers (`unevenness`),
+            which may be several: these are found by heights, where a network sees one thing. Not in training.
     """
 
     channels: int = 32
@@ -73,6 +76,7 @@ class TesNetConfig:
     told: bool = False
     caution: float = 0.0
     mirrored: int = 0
+    evenness: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -206,6 +210,8 @@ class TesNet(nn.Module):
         if self.config.caution and not self.training:
             unseen = behind[:, :PROBES_IN_FINGERS] > SHADOW_MARGIN
             logits = logits - self.config.caution * unseen.float().mean(dim=1)
+        if self.config.evenness and not self.training:
+            logits = logits - self.config.evenness * unevenness(cloud, candidates, at_fingers.index)
         return logits
 
 

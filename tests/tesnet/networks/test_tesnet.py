@@ -15,6 +15,7 @@ from tesnet.geometry import Pose
 from tesnet.hands import HANDS
 from tesnet.networks import encode
 from tesnet.networks.around_hand import PROBES_IN_FINGERS, probes
+from tesnet.networks.low_things import unevenness
 from tesnet.networks.tesnet import (
     CloudFeatures,
     TesNet,
@@ -29,10 +30,13 @@ from tesnet.networks.told import TOLD_INPUTS
 from tesnet.points import points_in_grasp_frames
 from tests.tesnet.scenes import (
     CAMERA,
+    UP,
     ask,
+    box_surface,
     fresh_network,
     moved_cloud,
     prepared,
+    seen_from,
     tabletop,
     tabletop_query,
     told_network,
@@ -217,6 +221,30 @@ def test_caution_takes_log_odds_by_the_part_of_the_fingers_that_no_camera_saw_bu
     expected = score(found) - 8.0 * share
     torch.testing.assert_close(careful.eval().score(features(), ready, found), expected, atol=1e-5, rtol=0)
     torch.testing.assert_close(careful.train().score(features(), ready, found), score(found), atol=1e-5, rtol=0)
+
+
+@torch.inference_mode()
+def test_uneven_low_things_cost_log_odds_in_both_mirrored_forms_but_not_in_training() -> None:
+    rng, boxes = np.random.default_rng(0), []
+    for height, side in ((0.012, -0.02), (0.02, 0.02)):
+        points, normals = box_surface((0.06, 0.038, height), 20_000, rng)
+        boxes.append(seen_from(points + np.array([0.0, side, height / 2]), normals, CAMERA))
+    query = ask(np.concatenate(boxes), up=UP, support_height=0.0, max_candidates=200)
+    ready = prepared(query)
+    found = candidates.generate(ready, query, candidates.CandidateConfig())[0]
+    plain, even = fresh_network(), TesNet(replace(fresh_network().config, evenness=4.0))
+    both, of_both = (TesNet(replace(net.config, mirrored=len(found))) for net in (plain, even))
+    for net in (even, both, of_both):
+        net.load_state_dict(plain.state_dict())
+    seen = plain.encode_batch([ready])[0]
+    lost = 4.0 * unevenness(ready, found, plain.closing.members(ready.points, found).index)
+    assert (lost > 1).any()
+    assert (lost == 0).any()
+    without = plain.score(seen, ready, found)
+    torch.testing.assert_close(even.eval().score(seen, ready, found), without - lost, atol=1e-5, rtol=0)
+    mirrored = both.eval().score(seen, ready, found)
+    torch.testing.assert_close(of_both.eval().score(seen, ready, found), mirrored - lost, atol=1e-5, rtol=0)
+    torch.testing.assert_close(even.train().score(seen, ready, found), without, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("network", [fresh_network, told_network])
