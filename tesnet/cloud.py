@@ -66,6 +66,9 @@ in twice the time of a tabletop scene of 30 cm."""
 _LONGEST_HAND = 0.35
 """Metres from a point within which lies all of a hand that approaches it."""
 
+MOST_UNSOUGHT = 3_000_000
+"""Points on which no grasp is looked for: of more, cells hold so many that some tell of all."""
+
 _SURROUNDINGS = 3
 _FEWEST_TOGETHER = 4
 
@@ -417,13 +420,16 @@ def _unsought(
     """The cells of other points that a hand at the points may meet, but none of isolated points (flying pixels).
 
     Isolated are those whose surroundings, a cube of `_SURROUNDINGS` cells' edge, hold fewer than `_FEWEST_TOGETHER`
-    points, or under a tenth of what a surface that crosses it holds where there are `a_cell` points in a cell.
+    points, or under a tenth of what a surface that crosses it holds where there are `a_cell` points in a cell. Of more
+    than `MOST_UNSOUGHT` points every second or third is looked at; ranked grasps are tried with all.
     """
     low, high = points.amin(dim=0) - _LONGEST_HAND, points.amax(dim=0) + _LONGEST_HAND
     others = _near(blocks, low, high, between)
     if len(others) == 0:
         return None
-    least = min(_FEWEST_TOGETHER, 0.1 * _SURROUNDINGS**2 * a_cell)
+    step = 1 + len(others) // MOST_UNSOUGHT
+    others = others[::step]
+    least = min(_FEWEST_TOGETHER, 0.1 * _SURROUNDINGS**2 * a_cell) / step
     surroundings, counts = members_of_cells(others, _SURROUNDINGS * voxel_size, between=between)
     others = others[(counts >= least)[surroundings]]
     del surroundings

@@ -81,6 +81,15 @@ def test_what_was_measured_long_ago_does_not_count() -> None:
     assert costs.expected(PLAIN, now=REMEMBERED_S + 1) == work(PLAIN)
 
 
+def test_what_one_network_took_is_not_measured_of_another() -> None:
+    costs = Costs()
+    slow = replace(PLAIN, model="edgegrasp")
+    costs.learn([slow], 9.0, now=0)
+    costs.learn([PLAIN], 0.1, now=0)
+    assert costs.measured(slow, now=1) == pytest.approx(9.0)
+    assert costs.measured(PLAIN, now=1) == pytest.approx(0.1)
+
+
 def test_the_shares_of_a_batch_add_up() -> None:
     costs = Costs()
     dear = replace(PLAIN, max_candidates=20_000)

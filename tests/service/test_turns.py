@@ -158,7 +158,10 @@ def test_places_are_counted_by_client() -> None:
     turns.remove(jobs[0])
     turns.remove(jobs[0])
     assert not turns.is_full_for("a")
+    turns.add(job(1.0, client="a"), busy=0.0)
+    assert turns.is_full_for("a")
     turns.clear()
+    turns.add(job(1.0, client="a"), busy=0.0)
     assert not any(turns.is_full_for(client) for client in ("a", None))
 
 

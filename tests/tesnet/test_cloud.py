@@ -360,3 +360,22 @@ def test_what_is_not_sought_counts_as_far_as_a_hand_reaches(
     other = torch.tensor([0.05, 0.1, 0.15])
     other[axis] = (points[1, axis] + distance) if sign > 0 else -distance
     assert (cloud._unsought(points, [other.expand(5, 3)], 0.0045, 10.0) is not None) == counts
+
+
+def test_of_very_many_others_some_are_looked_at_and_a_surface_stays_whole(monkeypatch: pytest.MonkeyPatch) -> None:
+    rng = np.random.default_rng(0)
+    surface = np.column_stack([rng.uniform(-0.1, 0.1, (40_000, 2)), np.zeros(40_000)])
+    stray = np.column_stack([rng.uniform(-0.1, 0.1, (30, 2)), rng.uniform(0.05, 0.15, 30)])
+    others = torch.from_numpy(rng.permutation(np.concatenate([surface, stray]))).float()
+
+    def looked_at() -> torch.Tensor:
+        found = cloud._unsought(torch.zeros(1, 3), [others], 0.0045, 20.0)
+        assert found is not None
+        return found.points
+
+    every = looked_at()
+    monkeypatch.setattr(cloud, "MOST_UNSOUGHT", 20_000)
+    some = looked_at()
+    assert max(float(points[:, 2].max()) for points in (every, some)) < 0.02
+    assert len(some) > 0.95 * len(every)
+    assert torch.cdist(every, some).amin(dim=1).max() < 0.0045

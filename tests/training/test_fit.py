@@ -46,6 +46,23 @@ def run(folder: Path, out: Path, recipe: Recipe = RECIPE, **options: Any) -> dic
     return fit("tesnet", [folder / "train"], [folder / "validation"], recipe, out, threads=1, **options)
 
 
+def test_the_log_tells_the_seconds_of_each_epoch_by_itself(
+    folder: Path, tmp_path: Path, monkeypatch: pytest.MonkeyPatch
+) -> None:
+    class Clock:
+        now = 0.0
+
+        def monotonic(self) -> float:
+            self.now += 1.0
+            return self.now
+
+    monkeypatch.setattr(fitting, "time", Clock())
+    run(folder, tmp_path / "a.safetensors", replace(RECIPE, max_epochs=3))
+    seconds = [json.loads(line)["seconds"] for line in (tmp_path / "a.log.jsonl").read_text().splitlines()]
+    assert seconds[0] > 0
+    assert seconds == [seconds[0]] * 3
+
+
 def test_a_stopped_run_goes_on_from_its_checkpoint(folder: Path, tmp_path: Path) -> None:
     run(folder, tmp_path / "whole.safetensors")
     run(folder, tmp_path / "parts.safetensors", epochs=1)

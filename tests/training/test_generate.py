@@ -81,6 +81,17 @@ def test_a_second_run_gives_equal_labels_and_a_longer_one_goes_on(labels: Path, 
     assert {name: after[name] for name in before} == before
 
 
+def test_a_scene_that_is_missing_is_made_and_the_others_are_left(labels: Path, tmp_path: Path) -> None:
+    generate(CONFIG, 1, 1, tmp_path / "again")
+    account = json.loads((tmp_path / "again" / "account.json").read_text())
+    first, *others = scene_files([tmp_path / "again"])
+    lost, kept = first.read_bytes(), {path: path.stat().st_mtime_ns for path in others}
+    first.unlink()
+    generate(CONFIG, account["labels"], 1, tmp_path / "again", resume=True)
+    assert first.read_bytes() == lost
+    assert {path: path.stat().st_mtime_ns for path in others} == kept
+
+
 def test_labels_show_the_clouds_as_the_service_prepares_them(monkeypatch: pytest.MonkeyPatch) -> None:
     """To the last bit, so that no network learns from normals of another neighbourhood than it is served."""
     queries: list[GraspQuery] = []
