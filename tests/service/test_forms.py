@@ -513,6 +513,12 @@ def test_a_far_cloud_has_the_grasps_of_a_near_one(http: httpx.Client, cloud: Clo
             np.testing.assert_allclose(far_grasp["position"] - offset, near_grasp["position"], atol=1e-5)
 
 
+def test_the_viewer_is_shown_the_points_of_a_far_cloud_where_they_are(http: httpx.Client) -> None:
+    far = np.array([[460_000.0, 5_402_000.0, 100.0], [460_001.0, 5_402_000.5, 100.25]])
+    shown = np.frombuffer(http.post("/viewer/points", json={"points": far.tolist()}).content, "<f4").reshape(-1, 3)
+    np.testing.assert_array_equal(shown, far.astype(np.float32))
+
+
 def test_what_looks_like_a_mistake_is_a_warning(http: httpx.Client, cloud: Cloud) -> None:
     view = box_on_table()
     k = view.camera["intrinsics"]
