@@ -23,7 +23,7 @@ import sys
 import tempfile
 import time
 from collections import defaultdict
-from collections.abc import Callable, Container, Iterable, Iterator, Mapping, Sequence
+from collections.abc import Container, Iterable, Iterator, Mapping, Sequence
 from concurrent.futures import ThreadPoolExecutor
 from contextlib import ExitStack, contextmanager, suppress
 from dataclasses import dataclass
@@ -104,11 +104,6 @@ def mirror_of(module: str, root: Path) -> tuple[str, ...]:
 def package_of(module: str) -> str:
     """The one of `PACKAGES` that a module belongs to."""
     return next(package for package in PACKAGES if module.startswith(f"{package}/"))
-
-
-def all_of_package(module: str, _: Path) -> tuple[str, ...]:
-    """The folder of all tests of a module's package."""
-    return (f"tests/{package_of(module)}",)
 
 
 def places(source: str) -> list[list[Change]]:
@@ -266,16 +261,16 @@ def try_all(chosen: Sequence[Mutant], workers: int, harmless: Container[tuple[st
     """
     with Laboratory(workers) as laboratory, ThreadPoolExecutor(workers) as pool:
 
-        def missed(mutants: Sequence[Mutant], tests_of: Callable[[str, Path], tuple[str, ...]]) -> list[Mutant]:
-            tests = [tests_of(mutant.module, ROOT) for mutant in mutants]
+        def missed(mutants: Sequence[Mutant], tests: Sequence[tuple[str, ...]]) -> list[Mutant]:
             different = sorted(set(tests))
             limits = dict(zip(different, map(limit, pool.map(laboratory.seconds, different)), strict=True))
             tried = pool.map(laboratory.notice, mutants, tests, [limits[files] for files in tests])
             noticed = list(tqdm(tried, total=len(mutants), unit="fault", file=sys.stderr))
             return [mutant for mutant, seen in zip(mutants, noticed, strict=True) if not seen]
 
-        left = missed(chosen, mirror_of)
-        unknown = missed([mutant for mutant in left if mutant.key not in harmless], all_of_package)
+        left = missed(chosen, [mirror_of(mutant.module, ROOT) for mutant in chosen])
+        unknown = [mutant for mutant in left if mutant.key not in harmless]
+        unknown = missed(unknown, [(f"tests/{package_of(mutant.module)}",) for mutant in unknown])
     return [mutant for mutant in left if mutant in unknown or mutant.key in harmless]
 
 
