@@ -30,9 +30,10 @@ def _load(name: NetworkName, settings: Settings) -> GraspPredictor:
     from tesnet.predictor import GraspPredictor  # noqa: PLC0415 - the same
     from tesnet.weights import default_weights  # noqa: PLC0415 - the same
 
-    if is_weightless(name):
+    path = settings.weights.get(name)
+    if path is None and is_weightless(name):
         return GraspPredictor.without_weights(name, settings.device, settings.num_threads)
-    path = settings.weights.get(name) or default_weights(name)
+    path = path or default_weights(name)
     predictor = GraspPredictor.load(path, settings.device, settings.num_threads)
     if predictor.model.name != name:
         raise WeightsError(path, f"holds {predictor.model.name}, not {name}; name it so in GRASP_MODELS")

@@ -36,12 +36,12 @@ from simharness.flags_from_settings import (
     sizes_parser,
     trials_of,
 )
-from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, RunFolder
+from simharness.play.folder import FAILURES_FILE, PAGE_FILE, REPORT_FILE, SERVICE_LOG, RunFolder
 from simharness.play.photographer import attempts_to_show, keep_only, take_pictures
 from simharness.play.records import Run
 from simharness.play.replay import find_attempt, replay
 from simharness.play.round import camera_sensor
-from simharness.play.run import Hooks, run
+from simharness.play.run import Hooks, check_that_it_answers, run
 from simharness.play.settings import RunSettings
 from simharness.report.causes import failures, failures_report, failures_table
 from simharness.report.compare import TABLE, Comparison
@@ -117,20 +117,38 @@ def _robustness(options: argparse.Namespace) -> int:
 def _compare(options: argparse.Namespace) -> int:
     trials = trials_of(options)
     folder = RunFolder(out_of(options, "compare"))
-    comparison = Comparison(trials)
+    comparison = Comparison(trials, package_versions())
 
     def take(name: str, result: Run) -> None:
         comparison.add(name, result)
-        folder.write_json(f"{TABLE}.json", comparison.report(package_versions()))
+        folder.write_json(f"{TABLE}.json", comparison.report())
         folder.write_text(f"{TABLE}.md", comparison.table())
         chart = comparison.chart()
         folder.write_text(f"{TABLE}.svg", chart.svg())
         chart.save_png(folder.path / f"{TABLE}.png")
 
     parts = [_Part(trial.name, trial.settings, trial.contestant.weights) for trial in trials]
+    _check_networks(options, parts, folder)
     code = _clear_each(options, parts, folder, take)
     print(f"\n{comparison.table()}\nchart     {folder.path / TABLE}.svg, .png")
     return code
+
+
+def _check_networks(options: argparse.Namespace, parts: Iterable[_Part], folder: RunFolder) -> None:
+    """Ask every network that is still to play whether it is there: hours later is too late to hear that one is not.
+
+    Raises:
+        RunBroken: the service does not answer.
+        UsageError: a network that is not there, or a folder that cannot be written.
+    """
+    folder.make()
+    asked = set()
+    for part in parts:
+        contestant = (part.settings.model, part.weights)
+        if contestant in asked or (options.resume and RunFolder(folder.path / part.name).is_complete(part.settings)):
+            continue
+        asked.add(contestant)
+        check_that_it_answers(part.settings, options.url, part.weights, folder.path / SERVICE_LOG)
 
 
 @dataclass(frozen=True, slots=True)

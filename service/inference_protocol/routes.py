@@ -20,7 +20,7 @@ from service.errors import (
     UnknownModel,
     shortened,
 )
-from service.grasps import Asked, GraspEndpoint, Reader, check_hand, chosen_model, refuse_compressed
+from service.grasps import Asked, GraspEndpoint, Reader, check_hand, refuse_compressed
 from service.inference_protocol.decoding import decode
 from service.inference_protocol.documentation import INFER_PROBLEMS, INFER_REQUEST, INFER_RESPONSES
 from service.inference_protocol.encoding import encode
@@ -125,7 +125,11 @@ def _reader(request: Request, settings: Settings, model: ModelInfo) -> Reader:
 
     def read(body: bytearray) -> Asked:
         asked = decode(body, None if head_length is None else int(head_length), settings.max_points)
-        options = asked.options.model_copy(update={"model": chosen_model(asked.options, [model]).name})
+        if asked.options.model not in (None, model.name):
+            raise Invalid(
+                "model", f"is {shortened(asked.options.model)}, but the path names {model.name}; leave it out"
+            )
+        options = asked.options.model_copy(update={"model": model.name})
         query = build_query(asked.payload, options, settings.max_points)
         check_hand(query, model)
 

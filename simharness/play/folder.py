@@ -12,6 +12,7 @@ from collections import defaultdict
 from collections.abc import Callable, Iterable, Iterator, Mapping
 from contextlib import suppress
 from dataclasses import asdict
+from importlib import metadata
 from pathlib import Path
 from typing import Any, TypeVar
 
@@ -44,6 +45,17 @@ class RunFolder:
 
     # Starting and continuing
 
+    def make(self, inside: str = ".") -> None:
+        """Make the folder, or one inside it, unless it is there.
+
+        Raises:
+            UsageError: it cannot be written.
+        """
+        try:
+            self._file(inside).mkdir(parents=True, exist_ok=True)
+        except OSError as error:
+            raise UsageError(f"--out {self.path}: {error.strerror}; give a folder that can be written") from error
+
     def prepare(self, settings: RunSettings, resume: bool) -> list[RoundRecord]:
         """Make the folder ready for a run and return the rounds that are already done.
 
@@ -52,21 +64,19 @@ class RunFolder:
         Raises:
             UsageError: the folder cannot be written, or `resume` meets a run with other settings.
         """
-        try:
-            self.pictures.mkdir(parents=True, exist_ok=True)
-        except OSError as error:
-            raise UsageError(f"--out {self.path}: {error.strerror}; give a folder that can be written") from error
+        self.make(PICTURES)
         if not self._file(RUN_FILE).exists():
             return []
         if not resume:
             self._set_aside()
             return []
         recorded = self.read_run()[0].to_json()
-        differing = [name for name, value in settings.to_json().items() if recorded[name] != value]
-        if differing:
-            changes = "; ".join(
-                f"{name} was {recorded[name]!r}, now {settings.to_json()[name]!r}" for name in differing
-            )
+        changes = "; ".join(
+            f"{name} was {recorded[name]!r}, now {value!r}"
+            for name, value in settings.to_json().items()
+            if recorded[name] != value
+        )
+        if changes:
             raise UsageError(
                 f"--resume {self.path}: the recorded run has other settings ({changes}); "
                 "repeat them or give another --out"
@@ -79,9 +89,16 @@ class RunFolder:
         """Write down what decides the results, and where answers come from, which does not.
 
         Raises:
-            UsageError: the folder's rounds were played with other weights.
+            UsageError: the folder's rounds were played with other weights or by another version of the harness.
         """
+        version = metadata.version("tes-net")
         if self._file(RUN_FILE).exists():
+            played_by = json.loads(self._file(RUN_FILE).read_text(encoding="utf-8")).get("version", version)
+            if played_by != version:
+                raise UsageError(
+                    f"--resume {self.path}: version {played_by} played its rounds, this is {version}, whose rounds are "
+                    "not the same; give another --out"
+                )
             recorded = self.read_run()[1]
             if recorded != model:
                 differing = [name for name, value in asdict(model).items() if asdict(recorded)[name] != value]
@@ -90,9 +107,13 @@ class RunFolder:
                     f"one (was {recorded}, now {model}); serve the same weights or give another --out"
                 )
         content = {"settings": settings.to_json(), "model": asdict(model), "serving": asdict(serving)}
-        self.write_json(RUN_FILE, content)
+        self.write_json(RUN_FILE, {**content, "version": version})
 
     # Reading
+
+    def is_complete(self, settings: RunSettings) -> bool:
+        """Whether every round of a run lies here."""
+        return self._file(RUN_FILE).exists() and len(self.read_rounds()) >= settings.rounds * len(settings.seeds)
 
     def read_run(self) -> tuple[RunSettings, ModelRecord, Serving]:
         """Settings, model and service of the recorded run.

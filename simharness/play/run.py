@@ -13,7 +13,7 @@ from pathlib import Path
 from tempfile import TemporaryDirectory
 from typing import Any
 
-from simharness.errors import RunBroken, SimError
+from simharness.errors import RunBroken, SimError, UsageError
 from simharness.play.crew import Crew, Done, Emit, Event, Work, crew
 from simharness.play.folder import SERVICE_LOG, RunFolder
 from simharness.play.photographer import Photographer, Picture
@@ -183,6 +183,29 @@ def _play(
         rounds = stack.enter_context(crew(task, min(workers, len(todo)), ray))
         for message in _messages(rounds, todo, service):
             log.take(message)
+
+
+def check_that_it_answers(settings: RunSettings, url: str | None, weights: Path | None, log: Path) -> None:
+    """Make sure that a run would find its network, before anything is played.
+
+    Args:
+        settings: of the run.
+        url: the service; None starts one, as the run would.
+        weights: file of the model for a service that is started.
+        log: file for its output.
+
+    Raises:
+        RunBroken: the service at `url` does not answer.
+        UsageError: it has no such network, or none can be started with it.
+    """
+    with ExitStack() as stack:
+        if url is None:
+            try:
+                url = stack.enter_context(LocalService(settings.model, log, weights=weights)).url
+            except RunBroken as error:
+                asked = settings.model if weights is None else f"{settings.model}={weights}"
+                raise UsageError(f"{asked} cannot be played: {error}") from error
+        stack.enter_context(_planner(url, settings)).model()
 
 
 def _planner(url: str, settings: RunSettings) -> HttpPlanner:

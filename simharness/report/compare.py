@@ -81,10 +81,12 @@ class Comparison:
 
     Args:
         trials: what is to be played; all of a condition with the same settings but for the network.
+        versions: of the packages (`package_versions`).
     """
 
-    def __init__(self, trials: Sequence[Trial]) -> None:
+    def __init__(self, trials: Sequence[Trial], versions: Mapping[str, str]) -> None:
         self._trials = trials
+        self._versions = versions
         self._runs: dict[str, Run] = {}
         self._paired: dict[str, Paired] = {}
         names = [trial.contestant.name for trial in trials]
@@ -108,18 +110,16 @@ class Comparison:
                     self._runs[trial.name].rounds, reference.rounds, np.random.default_rng(0)
                 )
 
-    def report(self, versions: Mapping[str, str]) -> dict[str, Any]:
-        """The content of table2.json; networks have the keys of report.json, rates and differences are fractions.
-
-        Args:
-            versions: of the packages.
-        """
+    def report(self) -> dict[str, Any]:
+        """The content of table2.json; networks have the keys of report.json, rates and differences are fractions."""
         settings = self._trials[0].settings.to_json()
+        own = ("scene", "executor", "model", "objects")
         return {
             "complete": self._complete,
             "reference": self._reference,
-            "settings": {name: value for name, value in settings.items() if name not in ("scene", "executor", "model")},
-            "versions": dict(versions),
+            "settings": {name: value for name, value in settings.items() if name not in own},
+            "objects": {trial.condition: trial.settings.objects for trial in self._trials},
+            "versions": dict(self._versions),
             "conditions": {
                 condition: {trial.contestant.name: self._entry(trial) for trial in self._done(condition)}
                 for condition in self._conditions
@@ -128,7 +128,7 @@ class Comparison:
 
     def table(self) -> str:
         """The rates in Markdown, one table for each scene and executor."""
-        lines = [self._title + "."]
+        lines = [self._title + ".", "", self._played_by + "."]
         if not self._complete:
             lines += ["", f"Incomplete: {len(self._runs)} of {len(self._trials)} runs."]
         for condition in self._conditions:
@@ -155,6 +155,11 @@ class Comparison:
         objects = ", ".join(dict.fromkeys(Path(trial.settings.objects).name for trial in self._trials))
         seeds = f"seed{'s' if len(settings.seeds) > 1 else ''} {' '.join(map(str, settings.seeds))}"
         return f"Objects {objects}, camera {settings.camera}, {seeds}, {settings.rounds} rounds for each seed"
+
+    @property
+    def _played_by(self) -> str:
+        commit = f", commit {self._versions['commit']}" if "commit" in self._versions else ""
+        return f"Played by version {self._versions.get('tes-net', 'unknown')}{commit}"
 
     def _done(self, condition: str) -> list[Trial]:
         """The finished trials of a condition."""

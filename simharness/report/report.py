@@ -3,9 +3,11 @@
 from __future__ import annotations
 
 import platform
+import subprocess
 from collections.abc import Sequence
 from contextlib import suppress
 from importlib import metadata
+from pathlib import Path
 from typing import Any
 
 from simharness.play.metrics import Percentiles, Rate, Summary, summarise
@@ -48,11 +50,16 @@ def report(run: Run, versions: dict[str, str]) -> dict[str, Any]:
 
 
 def package_versions() -> dict[str, str]:
-    """Versions of Python and of the installed packages that results depend on."""
+    """Versions of Python and of the installed packages that results depend on; the commit of a checkout."""
     versions = {"python": platform.python_version()}
     for name in _PACKAGES:
         with suppress(metadata.PackageNotFoundError):
             versions[name] = metadata.version(name)
+    root = Path(__file__).resolve().parents[2]
+    if (root / ".git").exists():
+        describe = ["git", "-C", str(root), "describe", "--always", "--dirty", "--exclude", "*"]
+        with suppress(OSError, subprocess.CalledProcessError):
+            versions["commit"] = subprocess.run(describe, capture_output=True, text=True, check=True).stdout.strip()
     return versions
 
 

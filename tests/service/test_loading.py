@@ -44,3 +44,14 @@ def test_weights_of_another_network_are_refused(tmp_path: Path) -> None:
     )
     made = predictor_factory(settings)()
     assert [(model.name, model.version) for model in made.models] == [("heuristic", "1"), ("edgegrasp", "3")]
+
+
+def test_a_file_of_a_network_without_parameters_decides_its_candidates(tmp_path: Path) -> None:
+    configuration = configuration_of(networks.build("heuristic"))
+    configuration["candidates"] |= {"centred": False, "max_depth": 0.021}
+    path = tmp_path / "other.safetensors"
+    weights.save(path, {}, weights.Header("heuristic", "7", configuration))
+    settings = load_settings({"GRASP_MODELS": "heuristic", "GRASP_WEIGHTS": f"heuristic={path}", "GRASP_DEVICE": "cpu"})
+    (made,) = predictor_factory(settings)().models
+    assert (made.version, made.weights_sha256) == ("7", weights.sha256(path))
+    assert made.configuration["candidates"]["max_depth"] == 0.021

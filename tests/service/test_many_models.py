@@ -84,7 +84,9 @@ def test_the_inference_protocol_has_a_path_for_each_network(served: httpx.Client
         (meta,) = (output["data"][0] for output in answer["outputs"] if output["name"] == "meta")
         assert json.loads(meta)["model"]["name"] == name
     other = {"inputs": [tensor], "parameters": {"model": "tesnet"}}
-    assert served.post("/v2/models/heuristic/infer", json=other).status_code == 422
+    refused = served.post("/v2/models/heuristic/infer", json=other)
+    assert refused.status_code == 422
+    assert refused.json()["error"] == "model: is tesnet, but the path names heuristic; leave it out"
     missing = served.get("/v2/models/gpd")
     assert missing.status_code == 404
     assert "loaded: tesnet, version" in missing.json()["error"]

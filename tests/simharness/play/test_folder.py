@@ -89,6 +89,32 @@ def test_resuming_refuses_other_weights(tmp_path: Path, make_settings: Any) -> N
         folder.start(make_settings(), dataclasses.replace(MODEL, weights_sha256="cd" * 32), SERVING)
 
 
+def test_resuming_refuses_another_version_of_the_harness(tmp_path: Path, make_settings: Any) -> None:
+    folder = RunFolder(tmp_path)
+    folder.prepare(make_settings(), resume=False)
+    folder.start(make_settings(), MODEL, SERVING)
+    folder.start(make_settings(), MODEL, SERVING)
+    content = json.loads((tmp_path / "run.json").read_text())
+    (tmp_path / "run.json").write_text(json.dumps(content | {"version": "0.0.1"}))
+    with pytest.raises(UsageError, match=r"version 0\.0\.1 played its rounds"):
+        folder.start(make_settings(), MODEL, SERVING)
+    del content["version"]  # as older versions wrote it
+    (tmp_path / "run.json").write_text(json.dumps(content))
+    folder.start(make_settings(), MODEL, SERVING)
+
+
+def test_a_run_is_complete_with_its_last_round(tmp_path: Path, make_settings: Any, run: Run) -> None:
+    folder, settings = RunFolder(tmp_path), make_settings(rounds=len(run.rounds))
+    folder.prepare(settings, resume=False)
+    assert not folder.is_complete(settings)
+    folder.start(settings, MODEL, SERVING)
+    for record in run.rounds:
+        assert not folder.is_complete(settings)
+        folder.append(record)
+    assert folder.is_complete(settings)
+    assert not folder.is_complete(make_settings(rounds=len(run.rounds) + 1))
+
+
 def test_an_earlier_run_is_kept_beside_a_new_one(tmp_path: Path, make_settings: Any, run: Run) -> None:
     folder = RunFolder(tmp_path)
     folder.prepare(make_settings(), resume=False)

@@ -34,10 +34,13 @@ def finished(trial: Trial, make_round: Any) -> Run:
 
 
 def test_every_network_has_counts_intervals_and_its_difference_to_tesnet(trials: list[Trial], make_round: Any) -> None:
-    comparison = Comparison(trials)
+    comparison = Comparison(trials, {"python": "3.11", "tes-net": "1.2.3", "commit": "0a1b2c3"})
     for trial in trials:
         comparison.add(trial.name, finished(trial, make_round))
-    content = comparison.report({"python": "3.11"})
+    content = comparison.report()
+    assert content["versions"]["commit"] == "0a1b2c3"
+    assert content["objects"] == {"packed-edge": trials[0].settings.objects, "pile-edge": trials[-1].settings.objects}
+    assert "Played by version 1.2.3, commit 0a1b2c3." in comparison.table()
     assert json.loads(json.dumps(content, allow_nan=False)) == content
     assert (content["complete"], content["reference"], list(content["conditions"])) == (
         True,
@@ -62,7 +65,7 @@ def test_every_network_has_counts_intervals_and_its_difference_to_tesnet(trials:
 def test_pairs_are_made_in_whatever_order_the_runs_come(trials: list[Trial], make_round: Any) -> None:
     tables = []
     for order in (trials, trials[::-1]):
-        comparison = Comparison(trials)
+        comparison = Comparison(trials, {})
         for trial in order:
             comparison.add(trial.name, finished(trial, make_round))
         tables.append(comparison.table())
@@ -70,9 +73,9 @@ def test_pairs_are_made_in_whatever_order_the_runs_come(trials: list[Trial], mak
 
 
 def test_a_comparison_that_was_broken_off_says_so_and_shows_what_it_has(trials: list[Trial], make_round: Any) -> None:
-    comparison = Comparison(trials)
+    comparison = Comparison(trials, {})
     comparison.add(trials[0].name, finished(trials[0], make_round))
-    content = comparison.report({})
+    content = comparison.report()
     assert content["complete"] is False
     assert content["conditions"]["packed-edge"]["edgegrasp-0"]["paired"] is None
     assert content["conditions"]["pile-edge"] == {}
@@ -81,11 +84,11 @@ def test_a_comparison_that_was_broken_off_says_so_and_shows_what_it_has(trials: 
 
 
 def test_without_tesnet_the_first_is_the_one_to_compare_with(trials: list[Trial]) -> None:
-    assert Comparison(trials[:1]).report({})["reference"] == "edgegrasp-0"
+    assert Comparison(trials[:1], {}).report()["reference"] == "edgegrasp-0"
 
 
 def test_runs_on_other_scenes_are_not_compared(trials: list[Trial], make_round: Any) -> None:
-    comparison = Comparison(trials)
+    comparison = Comparison(trials, {})
     comparison.add(trials[0].name, finished(trials[0], make_round))
     other = Run(trials[1].settings, 1, MODEL, None, (make_round(3, 0, ["success"]),), None)
     with pytest.raises(UsageError, match="no round in common"):
@@ -118,12 +121,26 @@ def test_the_command_plays_the_same_tables_with_every_network_and_resumes(
 
 
 @pytest.mark.sim
-def test_a_run_that_breaks_off_ends_the_command_and_keeps_what_was_compared(
+def test_a_network_that_is_not_there_is_named_before_anything_is_played(
     start_stub: Any, tmp_path: Path, capsys: pytest.CaptureFixture[str]
 ) -> None:
-    command = ["compare", "--models", "heuristic", "gpd", "--scenes", "packed", "--rounds", "1", "--out", str(tmp_path)]
-    assert main([*command, "--workers", "1", "--url", start_stub()]) == 2
+    command = ["compare", "--scenes", "packed", "--rounds", "1", "--out", str(tmp_path), "--workers", "1", "--models"]
+    assert main([*command, "heuristic", "gpd", "--url", start_stub()]) == 2
     assert "has tesnet, heuristic" in capsys.readouterr().err
+    assert main([*command, "heuristic", "nonsense"]) == 2
+    said = capsys.readouterr().err
+    assert "nonsense cannot be played" in said
+    assert "pointnetgpd" in said
+    assert not list(tmp_path.glob("**/run.json"))
+
+
+@pytest.mark.sim
+def test_a_run_that_breaks_off_ends_the_command_and_keeps_what_was_compared(start_stub: Any, tmp_path: Path) -> None:
+    command = ["compare", "--scenes", "packed", "--rounds", "1", "--out", str(tmp_path), "--workers", "1", "--models"]
+    assert main([*command, "heuristic", "--url", start_stub()]) == 0
+    # The second network's service dies in its round; the first one's is not played again.
+    again = [*command, "heuristic", "tesnet", "--resume", "--url", start_stub("--die-after", "0")]
+    assert main(again) == 3
     content = json.loads((tmp_path / "table2.json").read_text())
     assert content["complete"] is False
     assert list(content["conditions"]["packed-edge"]) == ["heuristic"]
@@ -135,7 +152,7 @@ def test_published_figures_stand_beside_the_executor_that_they_were_measured_wit
     strict = [replace(trial, settings=replace(trial.settings, executor="strict")) for trial in trials]
     tables = []
     for each in (trials, strict):
-        comparison = Comparison(each)
+        comparison = Comparison(each, {})
         for trial in each:
             comparison.add(trial.name, finished(trial, make_round))
         tables.append(comparison.table())

@@ -1,7 +1,9 @@
 from __future__ import annotations
 
 import json
+import subprocess
 from dataclasses import replace
+from pathlib import Path
 from typing import Any
 
 import numpy as np
@@ -81,4 +83,10 @@ def test_the_table_says_rates_intervals_and_failures(run: Run) -> None:
 
 
 def test_the_versions_of_what_decides_results_are_named() -> None:
-    assert {"python", "numpy", "pybullet"} <= set(package_versions())
+    versions = package_versions()
+    assert {"python", "numpy", "pybullet"} <= set(versions)
+    root = Path(__file__).resolve().parents[3]
+    assert ("commit" in versions) == (root / ".git").exists()
+    if "commit" in versions:
+        head = subprocess.run(["git", "-C", str(root), "rev-parse", "HEAD"], capture_output=True, text=True, check=True)
+        assert head.stdout.startswith(versions["commit"].removesuffix("-dirty"))
