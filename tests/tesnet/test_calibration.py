@@ -159,6 +159,9 @@ def test_an_implausible_correction_is_refused_with_its_limits(scale: float, degr
     found = correction(shown, CAMERA, UP, 0.0)
     assert isinstance(found, str)
     assert f"{MOST_TILT_DEG:g} degrees" in found
+    nothing_near = "no support is seen" in found
+    assert nothing_near or f"(limits {1 - MOST_SCALE:g} to {1 + MOST_SCALE:g}, {MOST_TILT_DEG:g} degrees)" in found
+    assert nothing_near == (degrees > 2 * MOST_TILT_DEG - 2)
     assert degrees or f"multiplied by {1 / scale:.3f}"[:-1] in found
 
 

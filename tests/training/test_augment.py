@@ -171,6 +171,12 @@ def test_a_view_without_up_or_table_is_left_as_it_is() -> None:
         assert torch.equal(varied.outcomes, bare.outcomes)
 
 
+def test_no_table_is_shown_where_its_height_is_not_known() -> None:
+    hanging = replace(VIEW, cloud=replace(VIEW.cloud, support_height=None))
+    for seed in range(30):
+        assert len(vary(hanging, np.random.default_rng(seed)).cloud) <= len(VIEW.cloud)
+
+
 def test_augmentation_repeats_for_a_seed_and_leaves_the_view_alone() -> None:
     before = VIEW.cloud.points.clone()
     assert torch.equal(turned(3).cloud.points, turned(3).cloud.points)

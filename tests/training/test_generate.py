@@ -90,6 +90,9 @@ def test_a_scene_that_is_missing_is_made_and_the_others_are_left(labels: Path, t
     generate(CONFIG, account["labels"], 1, tmp_path / "again", resume=True)
     assert first.read_bytes() == lost
     assert {path: path.stat().st_mtime_ns for path in others} == kept
+    # What is there counts: with as many labels as were asked for, nothing is made.
+    assert generate(CONFIG, account["labels"], 1, tmp_path / "again", resume=True)["labels"] == account["labels"]
+    assert scene_files([tmp_path / "again"]) == sorted([first, *others])
 
 
 def test_labels_show_the_clouds_as_the_service_prepares_them(monkeypatch: pytest.MonkeyPatch) -> None:

@@ -5,6 +5,7 @@ from __future__ import annotations
 import multiprocessing
 import os
 import signal
+import time
 from collections.abc import Iterator
 from contextlib import contextmanager
 from dataclasses import dataclass
@@ -65,6 +66,26 @@ def test_every_job_is_done_and_what_it_emits_is_heard() -> None:
         assert workers.hear(0) == []
         workers.give(7)
         assert hear(workers, 1)[0] == {7: 50}
+
+
+@dataclass(frozen=True)
+class NeverReady:
+    """Takes an hour to begin."""
+
+    def name(self, job: int) -> str:
+        return f"job {job}"
+
+    @contextmanager
+    def begin(self) -> Iterator[Work[int]]:
+        time.sleep(3600)
+        yield lambda job, emit: job
+
+
+def test_a_worker_that_does_not_end_is_ended(monkeypatch: pytest.MonkeyPatch) -> None:
+    monkeypatch.setattr(crew_module, "_STOPS_WITHIN_S", 0.2)
+    with crew(NeverReady(), 1, None):
+        assert multiprocessing.active_children()
+    assert not multiprocessing.active_children()
 
 
 def test_ctrl_c_does_not_end_a_worker_that_still_imports() -> None:

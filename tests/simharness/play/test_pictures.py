@@ -7,6 +7,7 @@ import pytest
 from PIL import Image
 from scipy.ndimage import distance_transform_edt
 
+from simharness.play import pictures
 from simharness.play.pictures import (
     PICTURE_SIZE,
     close_up,
@@ -16,7 +17,7 @@ from simharness.play.pictures import (
     segmentation_colours,
     widen,
 )
-from tesnet.geometry import PANDA, Pose
+from tesnet.geometry import PANDA, CameraIntrinsics, Pose
 
 
 def test_the_drawn_hand_is_as_wide_as_the_grasp_and_ends_at_the_fingertips() -> None:
@@ -57,6 +58,17 @@ def test_the_cloud_picture_holds_all_points_and_is_as_large_as_they_allow() -> N
         places.append(np.argwhere(seen).mean(axis=0))
     across = np.ptp(places, axis=0) / picture.shape[:2]
     assert 0.6 < across.max() < 1.0
+
+
+@pytest.mark.parametrize("side", [(-1, 0), (1, 0), (0, -1), (0, 1)])
+def test_what_lies_beside_the_picture_is_not_drawn_in_it(side: tuple[int, int]) -> None:
+    view = CameraIntrinsics(width=64, height=48, fx=50.0, fy=50.0, cx=32.0, cy=24.0)
+    canvas = np.full((48, 64, 3), 255, dtype=np.uint8)
+    # One metre before the camera, a few pixels outside.
+    place = np.array([[side[0] * 38 / 50, side[1] * 30 / 50, 1.0]], dtype=np.float32)
+    nearest = pictures._splat(canvas, place, np.zeros((1, 3), dtype=np.uint8), Pose.identity(), view)
+    assert (canvas == 255).all()
+    assert np.isinf(nearest).all()
 
 
 def test_an_empty_cloud_gives_a_picture_too() -> None:

@@ -28,6 +28,7 @@ def test_a_pose_keeps_every_bit(make_round: Any) -> None:
     matrix = np.random.default_rng(0).normal(size=(4, 4))
     again = AttemptRecord.from_json(through_json(replace(attempt, T_world_grasp=matrix).to_json()))
     assert again.T_world_grasp.tobytes() == matrix.tobytes()
+    assert again.to_json()["position"] == matrix[:3, 3].tolist()
     with pytest.raises(ValueError, match="read-only"):
         again.T_world_grasp[0, 0] = 1.0
 

@@ -6,7 +6,7 @@ from typing import Any
 
 import pytest
 
-from simharness.play.settings import Interval, RunSettings
+from simharness.play.settings import Interval, RunSettings, flags
 
 
 def test_settings_come_back_from_json(make_settings: Any) -> None:
@@ -28,6 +28,13 @@ def test_settings_that_lack_one_or_have_one_too_many_are_refused(make_settings: 
     del values["executor"]
     with pytest.raises(TypeError, match="executor"):
         RunSettings.from_json(values)
+
+
+def test_noise_may_be_none_or_any_under_a_metre() -> None:
+    asked = {name: flag.within for name, (_, flag) in flags().items() if flag.within is not None and "noise" in name}
+    assert len(asked) == 2
+    for within in asked.values():
+        assert [value in within for value in (0, 0.0008, 0.9, 1)] == [True, True, True, False]
 
 
 def test_an_interval_says_what_it_holds() -> None:

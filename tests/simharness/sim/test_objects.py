@@ -368,6 +368,25 @@ def test_primitives_are_measured_with_their_rotation(tmp_path: Path) -> None:
     assert names_of(load_object_set(str(tmp_path), "pile")) == ["box"]
 
 
+@pytest.mark.parametrize(
+    ("solid", "said"),
+    [
+        ('<box size="2.5 0.02 0.03"/>', "2.5 m"),
+        ('<box size="0.02 2.5 0.03"/>', "2.5 m"),
+        ('<box size="0.02 0.03 2.5"/>', "2.5 m"),
+        ('<sphere radius="1.25"/>', "2.5 m"),
+        ('<cylinder radius="0.02" length="2.5"/>', "2.5 m"),
+        ('<cylinder radius="1.25" length="0.02"/>', "2.5 m"),
+        ('<capsule radius="0.25" length="2"/>', "2.5 m"),
+    ],
+)
+def test_primitives_are_as_large_as_they_say(tmp_path: Path, solid: str, said: str) -> None:
+    shape = f"<collision><geometry>{solid}</geometry></collision>"
+    (tmp_path / "solid.urdf").write_text(f'<robot name="b"><link name="l">{shape}</link></robot>')
+    with pytest.raises(ObjectSetError, match=rf"{said} across"):
+        load_object_set(str(tmp_path), "pile")
+
+
 def test_an_unwritable_cache_says_what_to_do(tmp_path: Path) -> None:
     (tmp_path / "file").write_text("")
     with pytest.raises(ObjectSetError, match="XDG_CACHE_HOME"):
