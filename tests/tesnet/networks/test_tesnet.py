@@ -26,6 +26,7 @@ from tesnet.networks.tesnet import (
     edge_features,
     point_inputs,
 )
+from tesnet.networks.tips_on_slopes import tip_on_slope
 from tesnet.networks.told import TOLD_INPUTS
 from tesnet.points import points_in_grasp_frames
 from tests.tesnet.scenes import (
@@ -245,6 +246,34 @@ def test_uneven_low_things_cost_log_odds_in_both_mirrored_forms_but_not_in_train
     mirrored = both.eval().score(seen, ready, found)
     torch.testing.assert_close(of_both.eval().score(seen, ready, found), mirrored - lost, atol=1e-5, rtol=0)
     torch.testing.assert_close(even.train().score(seen, ready, found), without, atol=1e-5, rtol=0)
+
+
+@torch.inference_mode()
+def test_tips_on_slopes_cost_log_odds_in_both_mirrored_forms_but_not_in_training() -> None:
+    rim = np.random.default_rng(0).uniform(0, 2 * np.pi, 40_000), np.random.default_rng(1).uniform(0, 1, 40_000)
+    radius, height = 0.03 + 0.03 * rim[1], 0.06 * rim[1] ** 2  # the inside of a bowl
+    outward = np.stack([np.cos(rim[0]), np.sin(rim[0])], axis=1)
+    points = np.column_stack([radius[:, None] * outward, height])
+    normals = np.column_stack([-0.7 * outward, np.full(len(points), 0.7)])
+    outside = np.column_stack([(radius[:, None] + 0.008) * outward, height]), np.column_stack([outward, 0 * height])
+    shell = np.concatenate([seen_from(points, normals, CAMERA), seen_from(*outside, CAMERA)])
+    query = ask(shell, up=UP, support_height=-0.01, max_candidates=400, gripper=HANDS["rg2"].gripper)
+    ready = prepared(query)
+    found = candidates.generate(ready, query, candidates.CandidateConfig())[0]
+    plain, sure = told_network(), TesNet(replace(told_network().config, surefooted=4.0))
+    both, of_both = (TesNet(replace(net.config, mirrored=len(found))) for net in (plain, sure))
+    for net in (sure, both, of_both):
+        net.load_state_dict(plain.state_dict())
+    seen = plain.encode_batch([ready])[0]
+    rest = candidates.at_rest(ready, found)
+    lost = 4.0 * tip_on_slope(ready, rest, plain.closing.members(ready.points, rest).index)
+    assert (lost > 1).any()
+    assert (lost == 0).any()
+    without = plain.score(seen, ready, found)
+    torch.testing.assert_close(sure.eval().score(seen, ready, found), without - lost, atol=1e-5, rtol=0)
+    mirrored = both.eval().score(seen, ready, found)
+    torch.testing.assert_close(of_both.eval().score(seen, ready, found), mirrored - lost, atol=1e-5, rtol=0)
+    torch.testing.assert_close(sure.train().score(seen, ready, found), without, atol=1e-5, rtol=0)
 
 
 @pytest.mark.parametrize("network", [fresh_network, told_network])
