@@ -21,7 +21,7 @@ from tesnet.layers import PointTransformerConv, SAGEConv
 from tesnet.networks.around_hand import PROBES, PROBES_IN_FINGERS, Region, ends, probes, region_about
 from tesnet.networks.low_things import unevenness
 from tesnet.networks.network import mirror_factors
-from tesnet.networks.tips_on_slopes import tip_on_slope
+from tesnet.networks.rims import poor_pinch
 from tesnet.networks.told import TOLD_INPUTS, told_inputs
 from tesnet.patches import Patches, group, pool
 from tesnet.points import points_in_grasp_frames
@@ -59,8 +59,8 @@ class TesNetConfig:
             surroundings and of these reflected in the hand's plane. Not in training, which shows either.
         evenness: log odds that a candidate loses for low things of other heights between its fingers (`unevenness`),
             which may be several: these are found by heights, where a network sees one thing. Not in training.
-        surefooted: log odds that a candidate loses of a hand whose tips swing far, where a finger first meets a slope
-            with its tip alone (`tip_on_slope`). Not in training.
+        rims: log odds that a candidate of a hand whose tips swing far loses where it would pinch a rim that it drops
+            (`poor_pinch`). Not in training.
     """
 
     channels: int = 32
@@ -80,7 +80,7 @@ class TesNetConfig:
     caution: float = 0.0
     mirrored: int = 0
     evenness: float = 0.0
-    surefooted: float = 0.0
+    rims: float = 0.0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -216,8 +216,8 @@ class TesNet(nn.Module):
             logits = logits - self.config.caution * unseen.float().mean(dim=1)
         if self.config.evenness and not self.training:
             logits = logits - self.config.evenness * unevenness(cloud, candidates, at_fingers.index)
-        if self.config.surefooted and not self.training:
-            logits = logits - self.config.surefooted * tip_on_slope(cloud, candidates, at_fingers.index)
+        if self.config.rims and not self.training:
+            logits = logits - self.config.rims * poor_pinch(cloud, candidates, at_fingers.index)
         return logits
 
 

@@ -16,6 +16,7 @@ from tesnet.hands import HANDS
 from tesnet.networks import encode
 from tesnet.networks.around_hand import PROBES_IN_FINGERS, probes
 from tesnet.networks.low_things import unevenness
+from tesnet.networks.rims import poor_pinch
 from tesnet.networks.tesnet import (
     CloudFeatures,
     TesNet,
@@ -26,7 +27,6 @@ from tesnet.networks.tesnet import (
     edge_features,
     point_inputs,
 )
-from tesnet.networks.tips_on_slopes import tip_on_slope
 from tesnet.networks.told import TOLD_INPUTS
 from tesnet.points import points_in_grasp_frames
 from tests.tesnet.scenes import (
@@ -249,7 +249,7 @@ def test_uneven_low_things_cost_log_odds_in_both_mirrored_forms_but_not_in_train
 
 
 @torch.inference_mode()
-def test_tips_on_slopes_cost_log_odds_in_both_mirrored_forms_but_not_in_training() -> None:
+def test_rims_cost_log_odds_in_both_mirrored_forms_but_not_in_training() -> None:
     rim = np.random.default_rng(0).uniform(0, 2 * np.pi, 40_000), np.random.default_rng(1).uniform(0, 1, 40_000)
     radius, height = 0.03 + 0.03 * rim[1], 0.06 * rim[1] ** 2  # the inside of a bowl
     outward = np.stack([np.cos(rim[0]), np.sin(rim[0])], axis=1)
@@ -260,13 +260,13 @@ def test_tips_on_slopes_cost_log_odds_in_both_mirrored_forms_but_not_in_training
     query = ask(shell, up=UP, support_height=-0.01, max_candidates=400, gripper=HANDS["rg2"].gripper)
     ready = prepared(query)
     found = candidates.generate(ready, query, candidates.CandidateConfig())[0]
-    plain, sure = told_network(), TesNet(replace(told_network().config, surefooted=4.0))
+    plain, sure = told_network(), TesNet(replace(told_network().config, rims=4.0))
     both, of_both = (TesNet(replace(net.config, mirrored=len(found))) for net in (plain, sure))
     for net in (sure, both, of_both):
         net.load_state_dict(plain.state_dict())
     seen = plain.encode_batch([ready])[0]
     rest = candidates.at_rest(ready, found)
-    lost = 4.0 * tip_on_slope(ready, rest, plain.closing.members(ready.points, rest).index)
+    lost = 4.0 * poor_pinch(ready, rest, plain.closing.members(ready.points, rest).index)
     assert (lost > 1).any()
     assert (lost == 0).any()
     without = plain.score(seen, ready, found)

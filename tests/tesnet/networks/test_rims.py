@@ -1,4 +1,4 @@
-"""What a finger meets first: walls and slopes, as they mean, and against a loop over candidates, fingers and points."""
+"""Rims: what fingers meet first, as it is meant, and against a loop over candidates, fingers and points."""
 
 from __future__ import annotations
 
@@ -11,7 +11,7 @@ import torch
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.hands import HANDS
-from tesnet.networks.tips_on_slopes import tip_on_slope
+from tesnet.networks.rims import poor_pinch
 from tests.tesnet.scenes import bare_cloud, open_hands
 
 HAND = HANDS["rg2"].gripper
@@ -48,35 +48,50 @@ def hands(poses: torch.Tensor | None = None) -> Candidates:
 
 
 def of(cloud: PreparedCloud) -> float:
-    return float(tip_on_slope(cloud, hands(), torch.arange(len(cloud))[None])[0])
+    return float(poor_pinch(cloud, hands(), torch.arange(len(cloud))[None])[0])
 
 
 @pytest.mark.parametrize("side", [1, -1])
 def test_a_slope_that_the_tip_meets_counts_and_a_wall_does_not(side: int) -> None:
-    wall = face(-side, 0.01, 0)
+    wall = face(-side, 0.02, 0)
     assert of(seen(wall, face(side, 0.01, 0))) == 0
     assert of(seen(wall, face(side, 0.02, 40))) == 1
-    assert of(seen(face(side, 0.02, 40))) == 1
     steeper, flatter = (of(seen(wall, face(side, 0.02, lean))) for lean in (15, 20))
     assert 0 < steeper < flatter < 1
 
 
 def test_a_slope_that_the_middle_of_the_pad_meets_does_not_count() -> None:
-    amounts = [of(seen(face(1, 0.02, 40, (back, 0.02)))) for back in (0.0, 0.003, 0.006)]
+    wall = face(-1, 0.02, 0)
+    amounts = [of(seen(wall, face(1, 0.02, 40, (back, 0.02)))) for back in (0.0, 0.003, 0.006)]
     assert amounts[0] == 1
     assert 0 < amounts[1] < 1
     assert amounts[2] == 0
 
 
 def test_only_what_a_finger_meets_first_counts() -> None:
-    assert of(seen(face(1, 0.015, 40), face(1, 0.025, 0))) == 0
-    assert of(seen(face(1, 0.025, 40), face(1, 0.015, 0))) == 1
+    wall = face(-1, 0.02, 0)
+    assert of(seen(wall, face(1, 0.015, 40), face(1, 0.025, 0))) == 0
+    assert of(seen(wall, face(1, 0.025, 40), face(1, 0.015, 0))) == 1
 
 
 def test_what_is_seen_from_behind_is_no_slope() -> None:
-    points, normals = face(1, 0.02, 40)
-    assert of(seen((points, normals * [1, -1, 1]))) == 0
-    assert of(seen((points, normals * [1, 1, -1]))) == 0
+    wall, (points, normals) = face(-1, 0.02, 0), face(1, 0.02, 40)
+    assert of(seen(wall, (points, normals * [1, -1, 1]))) == 0
+    assert of(seen(wall, (points, normals * [1, 1, -1]))) == 0
+
+
+@pytest.mark.parametrize("side", [1, -1])
+def test_a_thin_wall_counts_of_which_one_face_was_seen(side: int) -> None:
+    near, far = face(side, 0.008, 0), face(-side, 0.004, 0)
+    points, normals = far
+    back = points, normals * [1, -1, 1]  # what the camera saw of the far side is the inside of the near one
+    assert of(seen(near, far)) == 0
+    assert of(seen(near, back)) == 1
+    assert of(seen(near)) == 1
+    thicker = [of(seen(face(side, at, 0), back)) for at in (0.012, 0.017, 0.023)]
+    assert thicker[0] == 1
+    assert 0 < thicker[1] < 1
+    assert thicker[2] == 0
 
 
 def test_where_nothing_lies_between_the_fingers_nothing_is_met() -> None:
@@ -90,11 +105,11 @@ def test_where_nothing_lies_between_the_fingers_nothing_is_met() -> None:
 )
 def test_it_concerns_hands_alone_whose_tips_swing_far(name: str, swings: bool) -> None:
     hand = HANDS[name].gripper
-    points, normals = face(1, 0.02, 40)
+    points, normals = (np.concatenate(parts) for parts in zip(face(1, 0.02, 40), face(-1, 0.02, 0), strict=True))
     points[:, 2] += hand.tip_offset - HAND.tip_offset
     cloud = seen((points, normals))
     candidates = replace(hands(), gripper=hand)
-    assert float(tip_on_slope(cloud, candidates, torch.arange(len(cloud))[None])[0]) == swings
+    assert float(poor_pinch(cloud, candidates, torch.arange(len(cloud))[None])[0]) == swings
 
 
 def test_it_is_what_a_loop_finds_wherever_the_hands_are() -> None:
@@ -108,10 +123,11 @@ def test_it_is_what_a_loop_finds_wherever_the_hands_are() -> None:
     poses[:, 0, 0], poses[:, 0, 1], poses[:, 1, 0], poses[:, 1, 1] = angle.cos(), -angle.sin(), angle.sin(), angle.cos()
     poses[:, :3, 3] = torch.from_numpy(rng.uniform(-0.01, 0.01, (60, 3))).float()
     index = torch.from_numpy(rng.integers(0, 400, (60, 12)))
-    found = tip_on_slope(cloud, hands(poses), index)
+    found = poor_pinch(cloud, hands(poses), index)
     assert (found > 0).sum() > 10
+    thin = 0
     for row in range(60):
-        expected = 0.0
+        expected, firsts, towards = 0.0, [], []
         for side in (1, -1):
             met: list[tuple[float, float, float, float]] = []
             for point in index[row].tolist():
@@ -124,9 +140,15 @@ def test_it_is_what_a_loop_finds_wherever_the_hands_are() -> None:
                 ):
                     met.append((side * y, HAND.tip_offset - z, -n_z, side * n_y))
             if met:
-                first = max(outward for outward, *_ in met)
-                near = np.array([rest for outward, *rest in met if outward >= first - 0.003])
+                firsts.append(max(outward for outward, *_ in met))
+                near = np.array([rest for outward, *rest in met if outward >= firsts[-1] - 0.003])
                 behind, leaning, facing = near.mean(axis=0)
                 amount = np.clip((0.006 - behind) / 0.004, 0, 1) * np.clip((leaning - 0.15) / 0.25, 0, 1)
                 expected = max(expected, float(amount * (facing > 0.3)))
+                towards.append(facing)
+        if firsts:
+            wall = np.clip((0.026 - sum(firsts)) / 0.008, 0, 1) * np.clip((-min(towards) - 0.4) / 0.4, 0, 1)
+            thin += wall > expected
+            expected = max(expected, float(wall))
         assert float(found[row]) == pytest.approx(expected, abs=1e-4)
+    assert thin > 2
