@@ -66,7 +66,6 @@ class CandidateConfig:
             taken to be horizontal. Most walls that fingers close on are upright, the noise of a normal tilts the hand,
             and beside a flat object the lower finger of a tilted hand meets the table.
         centred: whether the hand stands midway between the walls that it closes on, not over the approach point.
-        lean: how far off midway, towards a wall that was not seen, a hand stands at most that has little room, metres.
     """
 
     max_pair_distance: float = 0.038
@@ -78,12 +77,11 @@ class CandidateConfig:
     support_clearance: float = 0.004
     levelled_within_deg: float = 25.0
     centred: bool = True
-    lean: float = 0.0025
 
     @classmethod
     def stored(cls, limits: Mapping[str, Any]) -> CandidateConfig:
         """That of a weights file's header; those written before a rule was there do without it."""
-        return cls(**{"centred": False, "lean": 0.0, **limits})
+        return cls(**{"centred": False, **limits})
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -45,12 +45,6 @@ _LEAST_SPREAD = 0.02
 
 _FEWEST = 6
 
-_NARROW = 0.008
-"""With less beside each wall, midway, a hand that opens wide leans away from the wall that was seen."""
-
-_LEAST_ROOM = 0.001
-"""So much is left beside the wall that was seen."""
-
 _FARTHEST_UNSEEN = 0.02
 """No wall is taken to lie farther beyond what is seen."""
 
@@ -81,16 +75,13 @@ def fitted(
     `fitted` is what lies between the fingers and a margin beside each, `full` all that the hand opens. A hand whose
     tips swing forward stands where they come to rest on the walls. One that would come too low midway stops short;
     where that does not help it stays where it is, as wide as the policy says if that is clear of the support.
-
-    Where the hand has little room and one wall was not seen, it leans that way, by the configuration's `lean` at most:
-    how near it comes to the other is known.
     """
     ways = [midway for midway, asked in ((False, policy == "fitted"), (True, config.centred)) if asked]
     if len(candidates) == 0 or not ways:
         return candidates
     span, placed = spans(cloud, at_rest(cloud, candidates)), candidates
     for midway in ways:  # the last that is clear of the support counts
-        moved, low = clear_of_support(cloud, _moved(candidates, span, midway, policy, config.lean), config)
+        moved, low = clear_of_support(cloud, _moved(candidates, span, midway, policy), config)
         poses, widths = moved.Ts_canonical_grasp, moved.widths
         poses = torch.where(low[:, None, None], placed.Ts_canonical_grasp, poses)
         placed = replace(placed, Ts_canonical_grasp=poses, widths=torch.where(low, placed.widths, widths))
@@ -109,18 +100,14 @@ def reach_of_fitting(
     rise = 2 * hand.travel
     if not config.centred:
         return torch.zeros_like(near), torch.zeros_like(near), rise
-    least = (near - (hand.max_width + _FARTHEST_UNSEEN) / 2).clamp(max=0.0) - config.lean
+    least = (near - (hand.max_width + _FARTHEST_UNSEEN) / 2).clamp(max=0.0)
     return least, near.clamp(min=0.0), rise
 
 
-def _moved(
-    candidates: Candidates, span: Span, midway: bool, policy: Literal["fitted", "full"], lean: float
-) -> Candidates:
+def _moved(candidates: Candidates, span: Span, midway: bool, policy: Literal["fitted", "full"]) -> Candidates:
     hand = candidates.gripper
-    room = (hand.max_width - (span.near - span.far)) / 2
-    aside = torch.where(span.seen | (room > _NARROW), 0.0, (room - _LEAST_ROOM).clamp(0.0, lean))
     middle = (span.near + span.far) / 2
-    shift = middle - aside if midway else torch.zeros_like(middle)
+    shift = middle if midway else torch.zeros_like(middle)
     extent = (span.near - span.far + 2 * (middle - shift).abs()).clamp(0.0, hand.max_width)
     widths = candidates.widths
     if policy == "fitted":

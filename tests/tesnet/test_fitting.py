@@ -1,7 +1,6 @@
 from __future__ import annotations
 
 import functools
-from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -45,12 +44,10 @@ def slab(width: float, seed: int = 0, *, far_wall: bool = True) -> tuple[Prepare
     return prepared(ask(points, viewpoints=viewpoints, up=UP, support_height=0.0)), points
 
 
-def towards_y(
-    cloud: PreparedCloud, hand: Gripper = PANDA, *, centred: bool = True, width: str = "full", lean: float = 0.0
-) -> Candidates:
+def towards_y(cloud: PreparedCloud, hand: Gripper = PANDA, *, centred: bool = True, width: str = "full") -> Candidates:
     """Candidates that close along y on the bar from above, in the frame of its cloud."""
     query = ask(np.zeros((1, 3)), up=UP, support_height=0.0, gripper=hand, width=width, num_approach_points=64)
-    found = search(cloud, query, CandidateConfig(centred=centred, lean=lean)).candidates
+    found = search(cloud, query, CandidateConfig(centred=centred)).candidates
     Ts = cloud.T_cloud_canonical.matrix @ found.Ts_canonical_grasp.double().numpy()
     return found.select(torch.from_numpy((np.abs(Ts[:, 1, 1]) > 0.99) & (Ts[:, 2, 2] < -0.99)))
 
@@ -72,33 +69,6 @@ def test_hands_stand_midway_between_walls_seen_or_guessed(width: float, far_wall
     assert np.quantile(np.abs(off), 0.9) < 0.004
     aside = places(cloud, towards_y(cloud, centred=False))[:, 1]
     assert np.quantile(np.abs(aside), 0.9) > 0.15 * width  # what the rule is for
-
-
-@pytest.mark.parametrize(
-    ("width", "far_wall", "leans"),
-    [(0.07, False, 0.0025), (0.0765, False, 0.00075), (0.06, False, 0.0), (0.07, True, 0.0), (0.079, False, 0.0)],
-)
-def test_a_hand_with_little_room_leans_towards_a_wall_that_was_not_seen(
-    width: float, far_wall: bool, leans: float
-) -> None:
-    """The wall at +y is seen; beside it, too, at least a millimetre is left."""
-    cloud, _ = slab(width, far_wall=far_wall)
-    midway, leaning = (np.median(places(cloud, towards_y(cloud, lean=lean))[:, 1]) for lean in (0.0, 0.0025))
-    assert midway - leaning == pytest.approx(leans, abs=6e-4)
-
-
-def test_a_leaning_hand_is_fitted_to_hold_both_walls() -> None:
-    hand, pose = PANDA, torch.eye(4)[None]
-    nowhere = torch.zeros(1, dtype=torch.long)
-    found = Candidates(nowhere, nowhere, pose, torch.full((1,), hand.max_width), hand)
-    span = fitting.Span(torch.tensor([0.034]), torch.tensor([-0.036]), torch.tensor([False]))
-    moved = fitting._moved(found, span, True, "full", 0.0025)
-    assert float(moved.Ts_canonical_grasp[0, 1, 3]) == pytest.approx(-0.001 - 0.0025)
-    narrow = replace(found, gripper=replace(hand, max_width=0.085))
-    moved = fitting._moved(narrow, span, True, "fitted", 0.0025)
-    assert float(moved.widths[0]) == pytest.approx(min(0.085, 0.07 + 2 * 0.0025 + 2 * fitting.UNSEEN_MARGIN))
-    in_place = fitting._moved(narrow, span, False, "fitted", 0.0025)
-    assert float(in_place.Ts_canonical_grasp[0, 1, 3]) == 0
 
 
 def test_a_fitted_hand_opens_by_what_it_holds_and_a_margin_and_never_wider_than_it_can() -> None:
@@ -263,7 +233,7 @@ def test_a_hand_has_the_opening_of_the_place_where_it_stands(
 ) -> None:
     """Midway if that is clear of the support, else in place, else as it was found: pose and width from one of them."""
     hand, config = HANDS[name].gripper, CandidateConfig(centred=centred)
-    elsewhere, lean = 0, config.lean
+    elsewhere = 0
     for seed in range(2):
         query = tabletop_query(seed, max_candidates=800, gripper=hand)
         cloud = prepared(query)
@@ -272,7 +242,7 @@ def test_a_hand_has_the_opening_of_the_place_where_it_stands(
         expected = found
         for midway in (False, True):
             if centred if midway else policy == "fitted":
-                moved, low = clear_of_support(cloud, fitting._moved(found, span, midway, policy, lean), config)
+                moved, low = clear_of_support(cloud, fitting._moved(found, span, midway, policy), config)
                 rows = [
                     moved.select(torch.tensor([row])) if not low[row] else expected.select(torch.tensor([row]))
                     for row in range(len(found))
