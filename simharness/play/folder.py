@@ -93,13 +93,12 @@ class RunFolder:
         """
         version = metadata.version("tes-net")
         if self._file(RUN_FILE).exists():
-            played_by = json.loads(self._file(RUN_FILE).read_text(encoding="utf-8")).get("version", version)
-            if played_by != version:
+            _, recorded, _, played_by = self._recorded()
+            if played_by not in (None, version):
                 raise UsageError(
                     f"--resume {self.path}: version {played_by} played its rounds, this is {version}, whose rounds are "
                     "not the same; give another --out"
                 )
-            recorded = self.read_run()[1]
             if recorded != model:
                 differing = [name for name, value in asdict(model).items() if asdict(recorded)[name] != value]
                 raise UsageError(
@@ -121,10 +120,15 @@ class RunFolder:
         Raises:
             UsageError: there is none, or it cannot be read.
         """
+        return self._recorded()[:3]
+
+    def _recorded(self) -> tuple[RunSettings, ModelRecord, Serving, str | None]:
+        """The same, and the version that played it; None of older versions, which did not say."""
         try:
             values = json.loads(self._file(RUN_FILE).read_text(encoding="utf-8"))
             settings = RunSettings.from_json(values["settings"])
-            return settings, ModelRecord(**values["model"]), Serving(**values["serving"])
+            model, serving = ModelRecord(**values["model"]), Serving(**values["serving"])
+            return settings, model, serving, values.get("version")
         except (FileNotFoundError, NotADirectoryError):
             raise UsageError(f"{self.path} holds no run ({RUN_FILE} is missing); give the --out of a run") from None
         except (ValueError, KeyError, TypeError) as error:

@@ -211,12 +211,14 @@ class TesNet(nn.Module):
         if of_head is not None:
             joined = joined + of_head
         logits: Tensor = self.head(joined)[:, 0]
-        if self.config.caution and not self.training:
+        if self.training:
+            return logits
+        if self.config.caution:
             unseen = behind[:, :PROBES_IN_FINGERS] > SHADOW_MARGIN
             logits = logits - self.config.caution * unseen.float().mean(dim=1)
-        if self.config.evenness and not self.training:
+        if self.config.evenness:
             logits = logits - self.config.evenness * unevenness(cloud, candidates, at_fingers.index)
-        if self.config.rims and not self.training:
+        if self.config.rims:
             logits = logits - self.config.rims * poor_pinch(cloud, candidates, at_fingers.index)
         return logits
 

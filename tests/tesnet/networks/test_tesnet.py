@@ -224,6 +224,24 @@ def test_caution_takes_log_odds_by_the_part_of_the_fingers_that_no_camera_saw_bu
     torch.testing.assert_close(careful.train().score(features(), ready, found), score(found), atol=1e-5, rtol=0)
 
 
+def assert_costs(
+    plain: TesNet, config: TesNetConfig, lost: torch.Tensor, ready: cloud.PreparedCloud, found: Candidates
+) -> None:
+    """With a configuration candidates lose so many log odds (C,), mirrored or not, but not in training."""
+    costly = TesNet(config)
+    both, of_both = (TesNet(replace(net.config, mirrored=len(found))) for net in (plain, costly))
+    for net in (costly, both, of_both):
+        net.load_state_dict(plain.state_dict())
+    seen = plain.encode_batch([ready])[0]
+    assert (lost > 1).any()
+    assert (lost == 0).any()
+    without = plain.score(seen, ready, found)
+    torch.testing.assert_close(costly.eval().score(seen, ready, found), without - lost, atol=1e-5, rtol=0)
+    mirrored = both.eval().score(seen, ready, found)
+    torch.testing.assert_close(of_both.eval().score(seen, ready, found), mirrored - lost, atol=1e-5, rtol=0)
+    torch.testing.assert_close(costly.train().score(seen, ready, found), without, atol=1e-5, rtol=0)
+
+
 @torch.inference_mode()
 def test_uneven_low_things_cost_log_odds_in_both_mirrored_forms_but_not_in_training() -> None:
     rng, boxes = np.random.default_rng(0), []
@@ -233,19 +251,9 @@ def test_uneven_low_things_cost_log_odds_in_both_mirrored_forms_but_not_in_train
     query = ask(np.concatenate(boxes), up=UP, support_height=0.0, max_candidates=200)
     ready = prepared(query)
     found = candidates.generate(ready, query, candidates.CandidateConfig())[0]
-    plain, even = fresh_network(), TesNet(replace(fresh_network().config, evenness=4.0))
-    both, of_both = (TesNet(replace(net.config, mirrored=len(found))) for net in (plain, even))
-    for net in (even, both, of_both):
-        net.load_state_dict(plain.state_dict())
-    seen = plain.encode_batch([ready])[0]
+    plain = fresh_network()
     lost = 4.0 * unevenness(ready, found, plain.closing.members(ready.points, found).index)
-    assert (lost > 1).any()
-    assert (lost == 0).any()
-    without = plain.score(seen, ready, found)
-    torch.testing.assert_close(even.eval().score(seen, ready, found), without - lost, atol=1e-5, rtol=0)
-    mirrored = both.eval().score(seen, ready, found)
-    torch.testing.assert_close(of_both.eval().score(seen, ready, found), mirrored - lost, atol=1e-5, rtol=0)
-    torch.testing.assert_close(even.train().score(seen, ready, found), without, atol=1e-5, rtol=0)
+    assert_costs(plain, replace(plain.config, evenness=4.0), lost, ready, found)
 
 
 @torch.inference_mode()
@@ -260,20 +268,9 @@ def test_rims_cost_log_odds_in_both_mirrored_forms_but_not_in_training() -> None
     query = ask(shell, up=UP, support_height=-0.01, max_candidates=400, gripper=HANDS["rg2"].gripper)
     ready = prepared(query)
     found = candidates.generate(ready, query, candidates.CandidateConfig())[0]
-    plain, sure = told_network(), TesNet(replace(told_network().config, rims=4.0))
-    both, of_both = (TesNet(replace(net.config, mirrored=len(found))) for net in (plain, sure))
-    for net in (sure, both, of_both):
-        net.load_state_dict(plain.state_dict())
-    seen = plain.encode_batch([ready])[0]
-    rest = candidates.at_rest(ready, found)
+    plain, rest = told_network(), candidates.at_rest(ready, found)
     lost = 4.0 * poor_pinch(ready, rest, plain.closing.members(ready.points, rest).index)
-    assert (lost > 1).any()
-    assert (lost == 0).any()
-    without = plain.score(seen, ready, found)
-    torch.testing.assert_close(sure.eval().score(seen, ready, found), without - lost, atol=1e-5, rtol=0)
-    mirrored = both.eval().score(seen, ready, found)
-    torch.testing.assert_close(of_both.eval().score(seen, ready, found), mirrored - lost, atol=1e-5, rtol=0)
-    torch.testing.assert_close(sure.train().score(seen, ready, found), without, atol=1e-5, rtol=0)
+    assert_costs(plain, replace(plain.config, rims=4.0), lost, ready, found)
 
 
 @pytest.mark.parametrize("network", [fresh_network, told_network])
