@@ -66,6 +66,7 @@ class CandidateConfig:
             taken to be horizontal. Most walls that fingers close on are upright, the noise of a normal tilts the hand,
             and beside a flat object the lower finger of a tilted hand meets the table.
         centred: whether the hand stands midway between the walls that it closes on, not over the approach point.
+        centring: version of what has learned where that is (`tesnet.centring`); None goes by rules (`tesnet.fitting`).
     """
 
     max_pair_distance: float = 0.038
@@ -77,11 +78,12 @@ class CandidateConfig:
     support_clearance: float = 0.004
     levelled_within_deg: float = 25.0
     centred: bool = True
+    centring: str | None = "1"
 
     @classmethod
     def stored(cls, limits: Mapping[str, Any]) -> CandidateConfig:
         """That of a weights file's header; those written before a rule was there do without it."""
-        return cls(**{"centred": False, **limits})
+        return cls(**{"centred": False, "centring": None, **limits})
 
 
 @dataclass(frozen=True, eq=False, slots=True)

@@ -1,8 +1,9 @@
 """How wide the hand opens for each candidate, and where it stands between the walls that its fingers close on.
 
 A pair of points tells the wall of one finger, and of the other only that it lies beyond the approach point. What else
-was seen between the fingers tells more: how far the thing reaches, and how its surface turns away. Knows no network and
-no request. Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
+was seen between the fingers tells more: how far the thing reaches, and how its surface turns away. Where hands stand by
+what is learned (`tesnet.centring`), these rules tell widths alone. Knows no request. Vectorised torch; lengths in
+metres; everything in the cloud's canonical frame.
 """
 
 from __future__ import annotations
@@ -13,6 +14,7 @@ from typing import Literal
 import torch
 from torch import Tensor
 
+from tesnet import centring
 from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support, contact_places
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
@@ -76,12 +78,20 @@ def fitted(
     tips swing forward stands where they come to rest on the walls. One that would come too low midway stops short;
     where that does not help it stays where it is, as wide as the policy says if that is clear of the support.
     """
-    ways = [midway for midway, asked in ((False, policy == "fitted"), (True, config.centred)) if asked]
-    if len(candidates) == 0 or not ways:
+    asked = policy == "fitted"
+    if len(candidates) == 0 or not (asked or config.centred):
         return candidates
-    span, placed = spans(cloud, at_rest(cloud, candidates)), candidates
-    for midway in ways:  # the last that is clear of the support counts
-        moved, low = clear_of_support(cloud, _moved(candidates, span, midway, policy), config)
+    resting = at_rest(cloud, candidates)
+    near, learned = contact_places(cloud, resting), config.centring
+    span = spans(cloud, resting) if asked or learned is None else None
+    ways = [torch.zeros_like(near)] if asked else []
+    if config.centred and learned is not None:
+        ways.append(centring.shipped(learned, near.device).shifts(cloud, resting))
+    elif config.centred and span is not None:
+        ways.append((span.near + span.far) / 2)
+    placed = candidates
+    for shift in ways:  # the last that is clear of the support counts
+        moved, low = clear_of_support(cloud, _moved(candidates, near, shift, span if asked else None), config)
         poses, widths = moved.Ts_canonical_grasp, moved.widths
         poses = torch.where(low[:, None, None], placed.Ts_canonical_grasp, poses)
         placed = replace(placed, Ts_canonical_grasp=poses, widths=torch.where(low, placed.widths, widths))
@@ -100,23 +110,24 @@ def reach_of_fitting(
     rise = 2 * hand.travel
     if not config.centred:
         return torch.zeros_like(near), torch.zeros_like(near), rise
-    least = (near - (hand.max_width + _FARTHEST_UNSEEN) / 2).clamp(max=0.0)
-    return least, near.clamp(min=0.0), rise
+    first, last = -(hand.max_width + _FARTHEST_UNSEEN) / 2, 0.0
+    if config.centring is not None:
+        first, last = (float(place) * centring.place_unit(hand) for place in centring.PLACES[[0, -1]])
+    return (near + first).clamp(max=0.0), (near + last).clamp(min=0.0), rise
 
 
-def _moved(candidates: Candidates, span: Span, midway: bool, policy: Literal["fitted", "full"]) -> Candidates:
-    hand = candidates.gripper
-    middle = (span.near + span.far) / 2
-    shift = middle if midway else torch.zeros_like(middle)
-    extent = (span.near - span.far + 2 * (middle - shift).abs()).clamp(0.0, hand.max_width)
-    widths = candidates.widths
-    if policy == "fitted":
+def _moved(candidates: Candidates, near: Tensor, shift: Tensor, span: Span | None) -> Candidates:
+    """The candidates, moved (C,) along their closing direction, and opened by what a span tells that they will hold."""
+    hand, widths = candidates.gripper, candidates.widths
+    if span is not None:
+        beside = ((span.near + span.far) / 2 - shift).abs()
+        extent = (span.near - span.far + 2 * beside).clamp(0.0, hand.max_width)
         margin = torch.where(span.seen, MARGIN, UNSEEN_MARGIN)
         widths = (extent + 2 * margin).clamp(max=hand.max_width)
     poses = candidates.Ts_canonical_grasp.clone()
     poses[:, :3, 3] += shift[:, None] * poses[:, :3, 1]
     if hand.linkage_length is not None:
-        before, after = (2 * half.clamp(0.0, hand.max_width / 2) for half in (span.near, span.near - shift))
+        before, after = (2 * half.clamp(0.0, hand.max_width / 2) for half in (near, near - shift))
         rise = hand.tcp_at(widths) - hand.tcp_at(candidates.widths) - (hand.tcp_at(after) - hand.tcp_at(before))
         poses[:, :3, 3] += rise[:, None] * poses[:, :3, 2]
     return replace(candidates, Ts_canonical_grasp=poses, widths=widths)

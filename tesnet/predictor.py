@@ -13,7 +13,7 @@ from typing import Any, TypeAlias
 import numpy as np
 import torch
 
-from tesnet import calibration, candidates, cloud, collision, networks, notices, ranking, support, weights
+from tesnet import calibration, candidates, centring, cloud, collision, networks, notices, ranking, support, weights
 from tesnet.errors import DeviceError, GaveUp, WeightsError
 from tesnet.geometry import GraspSet, Pose
 from tesnet.networks import Network
@@ -90,6 +90,8 @@ class GraspPredictor:
         self._calibration = calibration
         self._preparation = cloud.PreparationConfig(**configuration["preparation"])
         self._candidates = candidates.CandidateConfig.stored(configuration["candidates"])
+        if self._candidates.centring is not None:  # fail here, not at the first query
+            centring.shipped(self._candidates.centring, device)
 
     @classmethod
     def load(cls, path: Path, device: str = "cpu", num_threads: int | None = None) -> GraspPredictor:
@@ -127,7 +129,8 @@ class GraspPredictor:
             raise ValueError(f"network {name!r} has weights; load them from a file")
         chosen = named_device(device)
         network = networks.build(name).eval()
-        sections = configuration_of(network)
+        rules = candidates.CandidateConfig(centring=None)
+        sections = configuration_of(network) | {"candidates": asdict(rules)}
         model = ModelInfo(name, "1", None, {}, sections)
         return cls(network.to(chosen), sections, (1.0, 0.0), model, chosen, num_threads)
 

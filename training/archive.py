@@ -20,7 +20,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from simharness.play.crew import Emit, Work, crew
+from simharness.play.crew import Emit, Task, Work, crew
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.scene import restore_scene
@@ -114,17 +114,58 @@ def unpack(
         LabelsError: no archive, objects that the sets do not hold, or scenes of another preparation in `out`.
         SimError: a worker failed.
     """
+    if there := next(iter(sorted(out.glob("scene_*.npz"))), None):
+        check_preparation(there, load_scene(there)[0], preparation)
+    renderer = _Renderer(objects, more_views, preparation)
+    return {"scenes": for_each_scene(archive, objects, renderer, out, "scene", workers, scenes=scenes, seed=seed)}
+
+
+@dataclass(frozen=True, eq=False, slots=True)
+class SceneFile:
+    """A scene of an archive, and the file that shall be made of it."""
+
+    scene: ArchivedScene
+    path: Path
+
+
+def for_each_scene(
+    archive: Path,
+    objects: str,
+    task: Task[SceneFile],
+    out: Path,
+    stem: str,
+    workers: int,
+    *,
+    scenes: int | None,
+    seed: int,
+) -> int:
+    """Has workers make a file `STEM_NUMBER.npz` in `out` of each scene of an archive, but of those that have one.
+
+    Args:
+        archive: folder of `labels_*.npz`.
+        objects: the object sets that the scenes were made of, joined with commas.
+        task: makes a file.
+        out: folder for the files.
+        stem: of their names.
+        workers: processes.
+        scenes: so many, drawn from the whole archive; None for all. Each keeps the number that it has in the archive.
+        seed: of the draw.
+
+    Returns:
+        How many scenes were chosen.
+
+    Raises:
+        LabelsError: no archive, or objects that the sets do not hold.
+        SimError: a worker failed.
+    """
     parts = sorted(archive.glob("labels_*.npz"))
     if not parts:
         raise LabelsError(f"{archive} holds no labels_*.npz; make one with `python -m training pack`")
     out.mkdir(parents=True, exist_ok=True)
-    if there := next(iter(sorted(out.glob("scene_*.npz"))), None):
-        check_preparation(there, load_scene(there)[0], preparation)
     chosen = _draw(parts, scenes, seed)
-    known = {kind: set(models) for kind, models in _models_by_kind(objects).items()}
+    known = {kind: set(models) for kind, models in models_by_kind(objects).items()}
     numbers, waiting = itertools.count(), 0
-    renderer = _Renderer(objects, more_views, preparation)
-    with crew(renderer, workers, ray=None) as renderers, tqdm(unit="scene") as progress:
+    with crew(task, workers, ray=None) as makers, tqdm(unit="scene") as progress:
         for part in parts:
             for scene, number in zip(read_part(part), numbers, strict=False):
                 if not chosen[number]:
@@ -132,15 +173,15 @@ def unpack(
                 description = scene.description
                 if missing := sorted({item["name"] for item in description["objects"]} - known[description["kind"]]):
                     raise LabelsError(f"--objects lacks {missing[0]}, which a scene of the archive holds; add its set")
-                path = out / f"scene_{number:07d}.npz"
+                path = out / f"{stem}_{number:07d}.npz"
                 if not path.exists():
-                    renderers.give(_Rendering(scene, path))
+                    makers.give(SceneFile(scene, path))
                     waiting += 1
             while waiting:
-                done = len(renderers.hear(_HEAR_S))
+                done = len(makers.hear(_HEAR_S))
                 waiting -= done
                 progress.update(done)
-    return {"scenes": int(chosen.sum())}
+    return int(chosen.sum())
 
 
 def _draw(parts: Sequence[Path], count: int | None, seed: int) -> NDArray[np.bool_]:
@@ -190,14 +231,6 @@ def _cameras_of(description: Mapping[str, Any], views: Sequence[LabelledView]) -
     return found
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Rendering:
-    """A scene to be rendered into a file."""
-
-    scene: ArchivedScene
-    path: Path
-
-
 @dataclass(frozen=True, slots=True)
 class _Renderer:
     """What a worker needs to render any scene."""
@@ -206,24 +239,25 @@ class _Renderer:
     more_views: MoreViews
     preparation: cloud.PreparationConfig
 
-    def name(self, job: _Rendering) -> str:
+    def name(self, job: SceneFile) -> str:
         """A scene in words."""
         return job.path.stem.replace("_", " ")
 
     @contextmanager
-    def begin(self) -> Iterator[Work[_Rendering]]:
+    def begin(self) -> Iterator[Work[SceneFile]]:
         """The object models, and what renders scenes of them."""
         os.nice(10)
         torch.set_num_threads(1)
-        models = _models_by_kind(self.objects)
+        models = models_by_kind(self.objects)
 
-        def render(job: _Rendering, _: Emit) -> None:
+        def render(job: SceneFile, _: Emit) -> None:
             _render_scene(job, models[job.scene.description["kind"]], self.more_views, self.preparation)
 
         yield render
 
 
-def _models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
+def models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
+    """The models of object sets, by the kind of scene and by name."""
     return {
         kind: {model.name: model for name in objects.split(",") for model in load_object_set(name, kind)}
         for kind in ("packed", "pile")
@@ -231,7 +265,7 @@ def _models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
 
 
 def _render_scene(
-    job: _Rendering, models: Mapping[str, ObjectModel], more_views: MoreViews, preparation: cloud.PreparationConfig
+    job: SceneFile, models: Mapping[str, ObjectModel], more_views: MoreViews, preparation: cloud.PreparationConfig
 ) -> None:
     views = job.scene.views
     # Not of the number of outcomes, which many scenes share.

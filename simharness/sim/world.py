@@ -308,6 +308,22 @@ class World:
         points: Any = bullet.getClosestPoints(body, other, limit, physicsClientId=self._client)
         return min((point[8] for point in points), default=None)
 
+    def first_hits(
+        self, starts: NDArray[np.float64], ends: NDArray[np.float64]
+    ) -> tuple[NDArray[np.int64], NDArray[np.float64]]:
+        """What rays meet first: the bodies (R,), -1 for none, and after which part (R,) of the way.
+
+        Args:
+            starts: (R, 3) metres.
+            ends: (R, 3) metres.
+        """
+        most = bullet.MAX_RAY_INTERSECTION_BATCH_SIZE - 1
+        hits: list[Any] = []
+        for first in range(0, len(starts), most):
+            some = slice(first, first + most)
+            hits += bullet.rayTestBatch(starts[some].tolist(), ends[some].tolist(), physicsClientId=self._client)
+        return np.array([hit[0] for hit in hits], dtype=np.int64), np.array([hit[2] for hit in hits])
+
     def save(self) -> int:
         """Remember the state of every body in memory; an id for `restore`."""
         return int(bullet.saveState(physicsClientId=self._client))

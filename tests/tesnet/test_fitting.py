@@ -1,6 +1,7 @@
 from __future__ import annotations
 
 import functools
+from dataclasses import replace
 from typing import Literal
 
 import numpy as np
@@ -22,6 +23,8 @@ from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
 from tesnet.search import search
 from tests.tesnet.scenes import UP, Array, ask, bare_cloud, prepared, tabletop_query
+
+BY_RULES = CandidateConfig(centring=None)
 
 ABOVE = np.array([0.05, -0.1, 0.6])
 
@@ -47,7 +50,7 @@ def slab(width: float, seed: int = 0, *, far_wall: bool = True) -> tuple[Prepare
 def towards_y(cloud: PreparedCloud, hand: Gripper = PANDA, *, centred: bool = True, width: str = "full") -> Candidates:
     """Candidates that close along y on the bar from above, in the frame of its cloud."""
     query = ask(np.zeros((1, 3)), up=UP, support_height=0.0, gripper=hand, width=width, num_approach_points=64)
-    found = search(cloud, query, CandidateConfig(centred=centred)).candidates
+    found = search(cloud, query, replace(BY_RULES, centred=centred)).candidates
     Ts = cloud.T_cloud_canonical.matrix @ found.Ts_canonical_grasp.double().numpy()
     return found.select(torch.from_numpy((np.abs(Ts[:, 1, 1]) > 0.99) & (Ts[:, 2, 2] < -0.99)))
 
@@ -137,7 +140,7 @@ def test_what_lies_between_the_fingers_is_what_each_pose_by_itself_has_there(nam
     hand = HANDS[name].gripper
     query = tabletop_query(max_candidates=40, gripper=hand)
     cloud = prepared(query)
-    found, _ = generate(cloud, query, CandidateConfig())
+    found, _ = generate(cloud, query, BY_RULES)
     near = contact_places(cloud, found)
     rows, y, n = (part.numpy() for part in fitting._between_fingers(cloud, found.Ts_canonical_grasp, near, hand))
     points, normals = cloud.points.double().numpy(), cloud.normals.double().numpy()
@@ -171,11 +174,11 @@ def test_what_lies_between_the_fingers_is_what_each_pose_by_itself_has_there(nam
 @pytest.mark.parametrize("policy", ["fitted", "full"])
 def test_a_hand_too_low_midway_stops_short_or_keeps_its_place(name: str, policy: Literal["fitted", "full"]) -> None:
     """Low things. Whatever was done: clear of the support, tips no less deep than the contact, as wide as was asked."""
-    hand, config, stayed = HANDS[name].gripper, CandidateConfig(centred=True), 0
+    hand, config, stayed = HANDS[name].gripper, BY_RULES, 0
     for seed in range(3):
         query = tabletop_query(seed, max_candidates=800, gripper=hand)
         cloud = prepared(query)
-        found, _ = generate(cloud, query, CandidateConfig())
+        found, _ = generate(cloud, query, BY_RULES)
         placed = fitting.fitted(cloud, found, config, policy=policy)
         clearance = hand_clearance(cloud, placed)
         assert float(clearance.min()) >= 0.0015 - 2e-5
@@ -195,10 +198,10 @@ def test_a_hand_too_low_midway_stops_short_or_keeps_its_place(name: str, policy:
 
 def test_a_hand_that_stays_where_it_is_opens_by_what_it_will_hold_all_the_same() -> None:
     """Only where even that is too low it arrives wide open."""
-    hand, config = HANDS["rg2"].gripper, CandidateConfig(centred=True)
+    hand, config = HANDS["rg2"].gripper, BY_RULES
     query = tabletop_query(1, max_candidates=2000, gripper=hand)
     cloud = prepared(query)
-    found, _ = generate(cloud, query, CandidateConfig())
+    found, _ = generate(cloud, query, BY_RULES)
     placed = fitting.fitted(cloud, found, config, policy="fitted")
     apart = (placed.Ts_canonical_grasp - found.Ts_canonical_grasp)[:, :3, 3]
     in_place = (apart * found.Ts_canonical_grasp[:, :3, 1]).sum(dim=1).abs() < 1e-6
@@ -220,7 +223,7 @@ def test_what_swinging_tips_will_hold_is_looked_for_where_they_rest(width: float
     pose[0, 2, 3] = -(hand.tcp_at(0.05) - hand.tcp_at(width))
     pair = torch.tensor([0]), torch.tensor([contact])
     candidate = Candidates(*pair, pose, torch.tensor([width]), hand)
-    placed = fitting.fitted(cloud, candidate, CandidateConfig(centred=True), policy="fitted")
+    placed = fitting.fitted(cloud, candidate, BY_RULES, policy="fitted")
     assert float(placed.widths[0]) == pytest.approx(0.05 + 2 * 0.014, abs=0.004)
     assert float(at_rest(cloud, placed).Ts_canonical_grasp[0, 2, 3]) == pytest.approx(0.0, abs=1e-6)
 
@@ -232,17 +235,19 @@ def test_a_hand_has_the_opening_of_the_place_where_it_stands(
     name: str, policy: Literal["fitted", "full"], centred: bool
 ) -> None:
     """Midway if that is clear of the support, else in place, else as it was found: pose and width from one of them."""
-    hand, config = HANDS[name].gripper, CandidateConfig(centred=centred)
+    hand, config = HANDS[name].gripper, replace(BY_RULES, centred=centred)
     elsewhere = 0
     for seed in range(2):
         query = tabletop_query(seed, max_candidates=800, gripper=hand)
         cloud = prepared(query)
-        found, _ = generate(cloud, query, CandidateConfig())
+        found, _ = generate(cloud, query, BY_RULES)
         span = fitting.spans(cloud, at_rest(cloud, found))
         expected = found
         for midway in (False, True):
             if centred if midway else policy == "fitted":
-                moved, low = clear_of_support(cloud, fitting._moved(found, span, midway, policy), config)
+                shift = (span.near + span.far) / 2 if midway else torch.zeros(len(found))
+                opens = span if policy == "fitted" else None
+                moved, low = clear_of_support(cloud, fitting._moved(found, span.near, shift, opens), config)
                 rows = [
                     moved.select(torch.tensor([row])) if not low[row] else expected.select(torch.tensor([row]))
                     for row in range(len(found))

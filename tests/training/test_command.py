@@ -40,7 +40,7 @@ def told(monkeypatch: pytest.MonkeyPatch) -> dict[str, Told]:
 
         return noted
 
-    for name in ("generate", "pack", "unpack", "fit", "mean", "evaluate", "compare"):
+    for name in ("generate", "pack", "unpack", "fit", "mean", "learn_centring", "evaluate", "compare"):
         monkeypatch.setattr(command, name, noting(getattr(command, name), calls.setdefault(name, [])))
     return calls
 
@@ -66,11 +66,15 @@ MEAN = {
     "weights": ("a.w", "b.w"), "validation": ("one", "two"), "preset": "product", "seed": 8, "version": "1.3",
     "out": "o/mean.w",
 }  # fmt: skip
+CENTRING = {
+    "archive": "packed", "objects": "procedural,ycb", "scenes": 12, "workers": 3, "samples": "drawn", "epochs": 4,
+    "seed": 6, "version": "1.4", "out": "o/centring.w",
+}  # fmt: skip
 COMPARE = {"data": "runs", "out": "tables", "validation": ("one", "two")}
 PACK = {"data": ("one", "two"), "out": "archive"}
 EVERY_OPTION: dict[str, dict[str, Any]] = {
     "generate": GENERATE, "pack": PACK, "unpack": UNPACK, "fit": FIT, "mean": MEAN, "evaluate": EVALUATE,
-    "compare": COMPARE,
+    "centring": CENTRING, "compare": COMPARE,
 }  # fmt: skip
 
 
@@ -137,6 +141,9 @@ def test_what_is_packed_rendered_averaged_measured_and_compared_is_what_the_opti
     needed = {name: MEAN[name] for name in ("weights", "validation", "out")}
     assert main(["mean", *words(needed)]) == 0
     assert told["mean"][1]["settings"] == {}
+    assert main(["centring", *words(CENTRING)]) == 0
+    files = {name: Path(str(CENTRING[name])) for name in ("archive", "samples", "out")}
+    assert told["learn_centring"] == [CENTRING | files]
     (evaluated,) = told["evaluate"]
     assert evaluated == {
         "name": "gpd", "path": Path("w.safetensors"), "data": paths(["one", "two"]), "seed": 4,

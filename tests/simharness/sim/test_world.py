@@ -71,6 +71,19 @@ def test_distances_are_those_of_the_surfaces(world: World) -> None:
     assert world.distance(cube, floor, limit=0.05) is None
 
 
+def test_rays_tell_what_they_meet_first_and_where(world: World) -> None:
+    """A cube before another one; more rays than Bullet takes at a time."""
+    front, _ = add_cube(world, 0.0, 0.0, 0.0), add_cube(world, 0.3, 0.0, 0.0)
+    count = 20_000
+    beside = np.where(np.arange(count) % 2 == 0, 0.0, 5.0)
+    starts, ends = (np.column_stack([np.full(count, x), beside, np.zeros(count)]) for x in (-1.0, 1.0))
+    bodies, way = world.first_hits(starts, ends)
+    assert set(bodies[::2]) == {front}
+    assert set(bodies[1::2]) == {-1}
+    np.testing.assert_allclose(-1 + 2 * way[::2], -HALF, atol=2e-3)
+    np.testing.assert_allclose(way[1::2], 1.0)
+
+
 def test_a_remembered_state_comes_back_and_goes_on_alike(world: World) -> None:
     world.add_static_box((0.5, 0.5, 0.05), (0.0, 0.0, -0.05), colour=WHITE)
     cube = add_cube(world, 0.0, 0.0, 0.1)
