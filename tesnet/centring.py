@@ -45,9 +45,12 @@ SEEN = BINS * _BY_BIN + BY_HAND
 _MOST_POINTS = 10.0
 _DEPTH_UNIT, _BREADTH_UNIT, _HEIGHT_UNIT = 0.05, 0.02, 0.1
 
-_TOWARDS_MIDDLE = 0.005
+_TOWARDS_MIDDLE = (0.003, 0.03)
 """Log probability that a place loses for each eightieth of the opening between it and the likely middle: where the hand
-has room to spare it stands in the middle."""
+hardly fits, and where it surely has room to spare."""
+
+_SURE, _ABOUT = 0.97, 0.01
+"""Of the likeliest place the probability that the fingers pass, from which on there is room to spare; within what."""
 
 _SHARPNESS = 0.03
 """Log probability within which places count as equally good; their mean is taken, so that rounding decides nothing."""
@@ -89,11 +92,14 @@ class Centring(nn.Module):
         """
         logits, middle = self(seen)
         places = PLACES.to(logits.device)
-        worth = nn.functional.logsigmoid(logits) - _TOWARDS_MIDDLE * (places - middle[:, None]).abs()
+        probable = nn.functional.logsigmoid(logits)
+        has_room = torch.sigmoid((probable.exp().amax(dim=1, keepdim=True) - _SURE) / _ABOUT)
+        (least, most), aside = _TOWARDS_MIDDLE, (places - middle[:, None]).abs()
+        worth = probable - (least + (most - least) * has_room) * aside
         best: Tensor = (worth / _SHARPNESS).softmax(dim=1) @ places
         return best
 
-    @torch.inference_mode()
+    @torch.no_grad()
     def shifts(self, cloud: PreparedCloud, candidates: Candidates) -> Tensor:
         """(C,) metres along the closing direction from where each hand stands to where it should.
 

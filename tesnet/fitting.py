@@ -18,6 +18,7 @@ from tesnet import centring
 from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support, contact_places
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
+from tesnet.outline import is_low
 from tesnet.points import points_in_grasp_frames
 
 MARGIN = 0.008
@@ -64,6 +65,10 @@ class Span:
     far: Tensor
     seen: Tensor
 
+    def select(self, which: Tensor) -> Span:
+        """The spans where the mask (C,) is true."""
+        return Span(self.near[which], self.far[which], self.seen[which])
+
 
 def fitted(
     cloud: PreparedCloud,
@@ -82,13 +87,11 @@ def fitted(
     if len(candidates) == 0 or not (asked or config.centred):
         return candidates
     resting = at_rest(cloud, candidates)
-    near, learned = contact_places(cloud, resting), config.centring
-    span = spans(cloud, resting) if asked or learned is None else None
+    near = contact_places(cloud, resting)
+    span = spans(cloud, resting) if asked or config.centring is None else None
     ways = [torch.zeros_like(near)] if asked else []
-    if config.centred and learned is not None:
-        ways.append(centring.shipped(learned, near.device).shifts(cloud, resting))
-    elif config.centred and span is not None:
-        ways.append((span.near + span.far) / 2)
+    if config.centred:
+        ways.append(_to_middle(cloud, resting, span, config.centring))
     placed = candidates
     for shift in ways:  # the last that is clear of the support counts
         moved, low = clear_of_support(cloud, _moved(candidates, near, shift, span if asked else None), config)
@@ -96,6 +99,29 @@ def fitted(
         poses = torch.where(low[:, None, None], placed.Ts_canonical_grasp, poses)
         placed = replace(placed, Ts_canonical_grasp=poses, widths=torch.where(low, placed.widths, widths))
     return placed
+
+
+def _to_middle(cloud: PreparedCloud, resting: Candidates, span: Span | None, learned: str | None) -> Tensor:
+    """(C,) how far each hand moves along its closing direction to stand between its walls.
+
+    Of low things all sides show, so there the rules tell it best whatever was learned.
+
+    Args:
+        cloud: what was seen.
+        resting: the candidates, their tips where they rest.
+        span: what lies between the fingers of all; None where it is known of none.
+        learned: version of what has learned it; None for the rules alone.
+    """
+    if learned is None:
+        by_rules = torch.ones_like(resting.approach, dtype=torch.bool)
+        shift = resting.widths.new_zeros(len(resting))
+    else:
+        by_rules = is_low(cloud)[resting.contact]
+        shift = centring.shipped(learned, resting.widths.device).shifts(cloud, resting)
+    if bool(by_rules.any()):
+        rules = spans(cloud, resting.select(by_rules)) if span is None else span.select(by_rules)
+        shift[by_rules] = (rules.near + rules.far) / 2
+    return shift
 
 
 def reach_of_fitting(
