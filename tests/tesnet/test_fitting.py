@@ -8,7 +8,7 @@ import numpy as np
 import pytest
 import torch
 
-from tesnet import fitting
+from tesnet import centring, fitting
 from tesnet.candidates import (
     CandidateConfig,
     Candidates,
@@ -21,6 +21,7 @@ from tesnet.candidates import (
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
+from tesnet.outline import is_low
 from tesnet.search import search
 from tests.tesnet.scenes import UP, Array, ask, bare_cloud, prepared, tabletop_query
 
@@ -273,3 +274,25 @@ def test_no_wall_is_guessed_more_than_20_mm_beyond_what_was_seen() -> None:
     seen = radius * np.cos(last)
     assert far.min() >= seen - 0.02 - 0.002
     assert (far < seen - 0.02 + 0.002).mean() > 0.3  # though the circle ends 26 mm beyond it
+
+
+@pytest.mark.parametrize("policy", ["fitted", "full"])
+def test_hands_on_low_things_go_by_rules_whatever_was_learned(policy: Literal["fitted", "full"]) -> None:
+    """Of the others each stands where the network has it; both are found beside each other."""
+    query = tabletop_query(1, max_candidates=800)
+    cloud = prepared(query)
+    found, _ = generate(cloud, query, BY_RULES)
+    low = is_low(cloud)[found.contact]
+    assert 10 < int(low.sum()) < len(found) - 10
+    resting = at_rest(cloud, found)
+    span = fitting.spans(cloud, resting)
+    shift = fitting._to_middle(cloud, resting, span if policy == "fitted" else None, "1")
+    rules = (span.near + span.far) / 2
+    torch.testing.assert_close(shift[low], rules[low])
+    learned = centring.shipped("1", torch.device("cpu")).shifts(cloud, resting)
+    torch.testing.assert_close(shift[~low], learned[~low])
+    assert float((learned - rules).abs().median()) > 1e-4
+    placed = fitting.fitted(cloud, found, replace(BY_RULES, centring="1"), policy=policy)
+    by_rules = fitting.fitted(cloud, found, BY_RULES, policy=policy)
+    assert torch.equal(placed.Ts_canonical_grasp[low], by_rules.Ts_canonical_grasp[low])
+    assert torch.equal(placed.widths[low], by_rules.widths[low])
