@@ -22,7 +22,7 @@ from tesnet.clearance import stopping_short
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import PANDA, Gripper
 from tesnet.outline import Outline, is_low, outline
-from tesnet.points import farthest_points
+from tesnet.points import farthest_points, points_in_grasp_frames
 from tesnet.query import MAX_APPROACH_POINTS, GraspQuery
 
 TIP_BEYOND_CONTACT = 0.007
@@ -38,6 +38,9 @@ _UPWARD = 0.5
 """The face of a low thing: the cosine of its normal with `up` is at least this."""
 
 _ROUNDING = 1e-5
+
+_BESIDE = 0.003
+"""What fingers close on lies no farther beside the hand's middle plane than half a finger's breadth and this."""
 
 _CLOSING_STEPS = 8
 """Into so many pieces the way of tips that swing is cut, which is then at most 0.3 mm off."""
@@ -480,6 +483,19 @@ def contact_places(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     """(C,) metres from the hand's middle to its contact point, along the closing direction."""
     poses = candidates.Ts_canonical_grasp
     return ((cloud.points[candidates.contact] - poses[:, :3, 3]) * poses[:, :3, 1]).sum(dim=1)
+
+
+def between_palm_and_tips(cloud: PreparedCloud, candidates: Candidates) -> tuple[Tensor, Tensor, Tensor, Tensor]:
+    """The cloud's P points in each grasp frame, (C, P): |x|, y, z, and which of them may lie between the fingers.
+
+    They do if they are as deep as the fingers and no farther beside the hand's middle plane than half a finger's
+    breadth and `_BESIDE`; how far apart the fingers are does not count.
+    """
+    hand = candidates.gripper
+    x, y, z = points_in_grasp_frames(cloud.points, candidates.Ts_canonical_grasp)
+    beside = x.abs_()
+    inside = (beside <= hand.finger_breadth / 2 + _BESIDE) & (z >= hand.palm_front) & (z <= hand.tip_offset)
+    return beside, y, z, inside
 
 
 def resting_widths(cloud: PreparedCloud, candidates: Candidates) -> Tensor:

@@ -15,15 +15,13 @@ import torch
 from torch import Tensor, nn
 
 from tesnet import weights
-from tesnet.candidates import Candidates, contact_places
+from tesnet.candidates import Candidates, between_palm_and_tips, contact_places
 from tesnet.cloud import PreparedCloud
 from tesnet.errors import WeightsError
 from tesnet.geometry import Gripper
-from tesnet.points import points_in_grasp_frames
 
 NAME = "centring"
 
-_BINS_OF_OPENING = 40
 _BINS_PAST_CONTACT, _BINS_BEHIND = 6, 42
 BINS = _BINS_PAST_CONTACT + _BINS_BEHIND
 """Slices across the closing direction, each a fortieth of the widest opening thick, from a few past the contact point
@@ -34,9 +32,6 @@ OPENING = 40.0
 
 PLACES = torch.arange(44) - 41.5
 """Where the hand's middle may stand, from the contact point, in eightieths of the widest opening."""
-
-_BESIDE = 0.003
-"""A thing's points lie no farther beside the hand's middle plane than half a finger's breadth and this."""
 
 _BY_BIN, BY_HAND = 6, 10
 SEEN = BINS * _BY_BIN + BY_HAND
@@ -125,10 +120,9 @@ def seen_between(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     these are not known, and the direction to the camera.
     """
     poses, hand = candidates.Ts_canonical_grasp, candidates.gripper
-    near, thickness = contact_places(cloud, candidates), hand.max_width / _BINS_OF_OPENING
-    x, y, z = points_in_grasp_frames(cloud.points, poses)
+    near, thickness = contact_places(cloud, candidates), 2 * place_unit(hand)
+    beside, y, z, inside = between_palm_and_tips(cloud, candidates)
     along = (near[:, None] - y) / thickness + _BINS_PAST_CONTACT
-    inside = (x.abs() <= hand.finger_breadth / 2 + _BESIDE) & (z >= hand.palm_front) & (z <= hand.tip_offset)
     inside &= (along >= 0) & (along < BINS)
     row, index = inside.nonzero(as_tuple=True)
     normals = cloud.normals[index]
@@ -139,7 +133,7 @@ def seen_between(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
             (normals * poses[row, :3, 1]).sum(dim=1),
             (normals * poses[row, :3, 2]).sum(dim=1),
             behind,
-            x[row, index].abs() / _BREADTH_UNIT,
+            beside[row, index] / _BREADTH_UNIT,
         ],
         dim=1,
     )

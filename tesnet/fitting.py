@@ -15,20 +15,23 @@ import torch
 from torch import Tensor
 
 from tesnet import centring
-from tesnet.candidates import CandidateConfig, Candidates, at_rest, clear_of_support, contact_places
+from tesnet.candidates import (
+    CandidateConfig,
+    Candidates,
+    at_rest,
+    between_palm_and_tips,
+    clear_of_support,
+    contact_places,
+)
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
 from tesnet.outline import is_low
-from tesnet.points import points_in_grasp_frames
 
 MARGIN = 0.008
 """Between each finger and the wall that it closes on, where that is seen."""
 
 UNSEEN_MARGIN = 0.014
 """The same for a wall that is not seen."""
-
-_BESIDE = 0.003
-"""A thing's points lie no farther beside the hand's middle plane than half a finger's breadth and this."""
 
 _BIN = 0.002
 _GAP = 0.016
@@ -167,8 +170,8 @@ def spans(cloud: PreparedCloud, candidates: Candidates) -> Span:
     y = m + r n holds for the places y and the components n of the normals along the closing direction, with m its
     middle and r its radius, so the line through them tells where it ends. That counts where it is beyond what was seen.
     """
-    poses, hand, near = candidates.Ts_canonical_grasp, candidates.gripper, contact_places(cloud, candidates)
-    row, y, n = _between_fingers(cloud, poses, near, hand)
+    hand, near = candidates.gripper, contact_places(cloud, candidates)
+    row, y, n = _between_fingers(cloud, candidates, near)
     end = _last_before_gap(row, near[row] - y, len(near), hand)
     own = near[row] - y <= end[row] + _BIN
     row, y, n = row[own], y[own], n[own]
@@ -182,14 +185,12 @@ def spans(cloud: PreparedCloud, candidates: Candidates) -> Span:
     return Span(near, torch.where(goes_on, beyond, last), seen)
 
 
-def _between_fingers(cloud: PreparedCloud, poses: Tensor, near: Tensor, hand: Gripper) -> tuple[Tensor, Tensor, Tensor]:
+def _between_fingers(cloud: PreparedCloud, candidates: Candidates, near: Tensor) -> tuple[Tensor, Tensor, Tensor]:
     """Candidates (K,), places y (K,) and components of normals along y (K,) of the points between the fingers."""
-    half = hand.finger_breadth / 2 + _BESIDE
-    x, y, z = points_in_grasp_frames(cloud.points, poses)
-    inside = (x.abs_() <= half) & (z >= hand.palm_front) & (z <= hand.tip_offset)
-    inside &= (y <= near[:, None] + _BIN) & (y >= near[:, None] - hand.max_width)
+    _, y, _, inside = between_palm_and_tips(cloud, candidates)
+    inside &= (y <= near[:, None] + _BIN) & (y >= near[:, None] - candidates.gripper.max_width)
     row, index = inside.nonzero(as_tuple=True)
-    return row, y[row, index], (cloud.normals[index] * poses[row, :3, 1]).sum(dim=1)
+    return row, y[row, index], (cloud.normals[index] * candidates.Ts_canonical_grasp[row, :3, 1]).sum(dim=1)
 
 
 def _last_before_gap(row: Tensor, depth: Tensor, count: int, hand: Gripper) -> Tensor:

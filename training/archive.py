@@ -8,9 +8,10 @@ from __future__ import annotations
 
 import itertools
 import os
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Callable, Iterator, Mapping, Sequence
 from contextlib import contextmanager
 from dataclasses import dataclass, replace
+from functools import partial
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -20,7 +21,7 @@ import torch
 from numpy.typing import NDArray
 from tqdm import tqdm
 
-from simharness.play.crew import Emit, Task, Work, crew
+from simharness.play.crew import Emit, Work, crew
 from simharness.sim.objects import ObjectModel, load_object_set
 from simharness.sim.outcome_kinds import OUTCOME_KINDS
 from simharness.sim.scene import restore_scene
@@ -116,8 +117,8 @@ def unpack(
     """
     if there := next(iter(sorted(out.glob("scene_*.npz"))), None):
         check_preparation(there, load_scene(there)[0], preparation)
-    renderer = _Renderer(objects, more_views, preparation)
-    return {"scenes": for_each_scene(archive, objects, renderer, out, "scene", workers, scenes=scenes, seed=seed)}
+    render = partial(_render_scene, more_views=more_views, preparation=preparation)
+    return {"scenes": for_each_scene(archive, objects, render, out, "scene", workers, scenes=scenes, seed=seed)}
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -128,10 +129,14 @@ class SceneFile:
     path: Path
 
 
+Make = Callable[[SceneFile, Mapping[str, ObjectModel]], None]
+"""Makes the file of a scene, of object models by their names. It is sent to workers, so it can be pickled."""
+
+
 def for_each_scene(
     archive: Path,
     objects: str,
-    task: Task[SceneFile],
+    make: Make,
     out: Path,
     stem: str,
     workers: int,
@@ -144,7 +149,7 @@ def for_each_scene(
     Args:
         archive: folder of `labels_*.npz`.
         objects: the object sets that the scenes were made of, joined with commas.
-        task: makes a file.
+        make: makes a file.
         out: folder for the files.
         stem: of their names.
         workers: processes.
@@ -163,9 +168,9 @@ def for_each_scene(
         raise LabelsError(f"{archive} holds no labels_*.npz; make one with `python -m training pack`")
     out.mkdir(parents=True, exist_ok=True)
     chosen = _draw(parts, scenes, seed)
-    known = {kind: set(models) for kind, models in models_by_kind(objects).items()}
+    known = {kind: set(models) for kind, models in _models_by_kind(objects).items()}
     numbers, waiting = itertools.count(), 0
-    with crew(task, workers, ray=None) as makers, tqdm(unit="scene") as progress:
+    with crew(_Maker(objects, make), workers, ray=None) as makers, tqdm(unit="scene") as progress:
         for part in parts:
             for scene, number in zip(read_part(part), numbers, strict=False):
                 if not chosen[number]:
@@ -232,12 +237,11 @@ def _cameras_of(description: Mapping[str, Any], views: Sequence[LabelledView]) -
 
 
 @dataclass(frozen=True, slots=True)
-class _Renderer:
-    """What a worker needs to render any scene."""
+class _Maker:
+    """What a worker needs to make the file of any scene."""
 
     objects: str
-    more_views: MoreViews
-    preparation: cloud.PreparationConfig
+    make: Make
 
     def name(self, job: SceneFile) -> str:
         """A scene in words."""
@@ -245,19 +249,18 @@ class _Renderer:
 
     @contextmanager
     def begin(self) -> Iterator[Work[SceneFile]]:
-        """The object models, and what renders scenes of them."""
+        """The object models, and what makes files of scenes of them."""
         os.nice(10)
         torch.set_num_threads(1)
-        models = models_by_kind(self.objects)
+        models = _models_by_kind(self.objects)
 
-        def render(job: SceneFile, _: Emit) -> None:
-            _render_scene(job, models[job.scene.description["kind"]], self.more_views, self.preparation)
+        def work(job: SceneFile, _: Emit) -> None:
+            self.make(job, models[job.scene.description["kind"]])
 
-        yield render
+        yield work
 
 
-def models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
-    """The models of object sets, by the kind of scene and by name."""
+def _models_by_kind(objects: str) -> dict[str, dict[str, ObjectModel]]:
     return {
         kind: {model.name: model for name in objects.split(",") for model in load_object_set(name, kind)}
         for kind in ("packed", "pile")
@@ -311,10 +314,10 @@ def _shifts(view: LabelledView, places: NDArray[np.float64]) -> torch.Tensor:
 
 def _render_view(world: World, view: ArchivedView, preparation: cloud.PreparationConfig) -> LabelledView | None:
     """The view as its sensor sees it, with every label: poses stay, the nearest points stand for those of the pairs."""
-    query = view.viewing.query(view.viewing.observe(world), 0, view.gripper)
-    prepared = cloud.prepare(query, preparation, torch.device("cpu"))
-    if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
+    looked = view.viewing.look(world, 0, view.gripper, preparation)
+    if looked is None:
         return None
+    _, prepared = looked
     to_canonical = prepared.T_cloud_canonical.inverse()
     places = torch.tensor(to_canonical.apply(view.places.reshape(-1, 3))).float()
     nearest = nearest_neighbours(prepared.points, 1, places)[:, 0].view(-1, 2)

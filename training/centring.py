@@ -6,10 +6,8 @@ from its cameras and from others, gives candidates by the hundred whose hand pas
 
 from __future__ import annotations
 
-import os
 from collections.abc import Iterator, Mapping, Sequence
-from contextlib import contextmanager
-from dataclasses import dataclass
+from functools import partial
 from io import BytesIO
 from pathlib import Path
 from typing import Any
@@ -22,15 +20,14 @@ from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, l1_loss
 from tqdm import tqdm
 
-from simharness.play.crew import Emit, Work
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import restore_scene
 from simharness.sim.world import World
-from tesnet import centring, cloud, weights
+from tesnet import centring, weights
 from tesnet.candidates import CandidateConfig, Candidates, at_rest, contact_places, generate
-from tesnet.cloud import PreparedCloud
+from tesnet.cloud import PreparationConfig, PreparedCloud
 from tesnet.whole_file import write_whole
-from training.archive import SceneFile, for_each_scene, models_by_kind
+from training.archive import SceneFile, for_each_scene
 from training.parts import ArchivedScene
 from training.viewing import MoreViews
 from training.views import LabelsError
@@ -96,35 +93,17 @@ def sample(
         LabelsError: no archive, or objects that the sets do not hold.
         SimError: a worker failed.
     """
-    sampler = _Sampler(objects, seed)
-    return {"scenes": for_each_scene(archive, objects, sampler, out, "walls", workers, scenes=scenes, seed=seed)}
+    make = partial(_sample_scene, seed=seed)
+    return {"scenes": for_each_scene(archive, objects, make, out, "walls", workers, scenes=scenes, seed=seed)}
 
 
-@dataclass(frozen=True, slots=True)
-class _Sampler:
-    """What a worker needs to sample any scene."""
-
-    objects: str
-    seed: int
-
-    def name(self, job: SceneFile) -> str:
-        return job.path.stem.replace("_", " ")
-
-    @contextmanager
-    def begin(self) -> Iterator[Work[SceneFile]]:
-        os.nice(10)
-        torch.set_num_threads(1)
-        models = models_by_kind(self.objects)
-
-        def draw(job: SceneFile, _: Emit) -> None:
-            found = list(_of_scene(job.scene, models[job.scene.description["kind"]], self.seed))
-            seen = np.concatenate([np.zeros((0, centring.SEEN), np.float32), *(part for part, _ in found)])
-            walls = np.concatenate([np.zeros((0, 2), np.float32), *(part for _, part in found)])
-            packed = BytesIO()
-            np.savez(packed, seen=seen.astype(np.float16), walls=walls)
-            write_whole(job.path, packed.getvalue())
-
-        yield draw
+def _sample_scene(job: SceneFile, models: Mapping[str, ObjectModel], *, seed: int) -> None:
+    found = list(_of_scene(job.scene, models, seed))
+    seen = np.concatenate([np.zeros((0, centring.SEEN), np.float32), *(part for part, _ in found)])
+    walls = np.concatenate([np.zeros((0, 2), np.float32), *(part for _, part in found)])
+    packed = BytesIO()
+    np.savez(packed, seen=seen.astype(np.float16), walls=walls)
+    write_whole(job.path, packed.getvalue())
 
 
 def _of_scene(scene: ArchivedScene, models: Mapping[str, ObjectModel], seed: int) -> Iterator[tuple[Floats, Floats]]:
@@ -136,10 +115,10 @@ def _of_scene(scene: ArchivedScene, models: Mapping[str, ObjectModel], seed: int
     with World() as world:
         restore_scene(world, scene.description, models)
         for viewing in [view.viewing for view in scene.views] + _MORE_VIEWS.draw(rng):
-            query = viewing.query(viewing.observe(world), int(rng.integers(2**31)), hand)
-            prepared = cloud.prepare(query, cloud.PreparationConfig(), torch.device("cpu"))
-            if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
+            looked = viewing.look(world, int(rng.integers(2**31)), hand, PreparationConfig())
+            if looked is None:
                 continue
+            query, prepared = looked
             found, _ = generate(prepared, query, CandidateConfig())
             some = found.select(torch.from_numpy(rng.permutation(len(found))[:_CANDIDATES]))
             resting = at_rest(prepared, some)
@@ -182,7 +161,7 @@ def _walls(world: World, prepared: PreparedCloud, candidates: Candidates) -> Flo
 def fit(samples: Path, out: Path, *, epochs: int = EPOCHS, seed: int = 0, version: str = "0") -> dict[str, Any]:
     """Fits a network to all samples in a folder, writes it to `out` and returns how often hands pass, held out.
 
-    Of things that fit into the hand, that is; of others nothing is to be learned.
+    Things that do not fit into the hand teach where it does not pass; how often it passes is told of the others.
 
     Args:
         samples: folder of `sample`.

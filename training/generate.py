@@ -295,10 +295,10 @@ def _label_view(
     rng: np.random.Generator,
     judge: Judge,
 ) -> LabelledView | None:
-    query = viewing.query(viewing.observe(world), int(rng.integers(2**31)), hand.gripper)
-    prepared = cloud.prepare(query, judge.preparation, torch.device("cpu"))
-    if prepared is None or len(prepared) < cloud.MINIMUM_POINTS:
+    looked = viewing.look(world, int(rng.integers(2**31)), hand.gripper, judge.preparation)
+    if looked is None:
         return None
+    query, prepared = looked
     searched = search(prepared, query, candidates.CandidateConfig())
     found, free = searched.candidates, searched.is_free
     chosen = _choose(prepared, found, free, config, rng, judge.network)

@@ -7,6 +7,7 @@ from dataclasses import dataclass, replace
 from typing import Any, Literal, cast, get_args
 
 import numpy as np
+import torch
 
 from simharness.sim.camera import PRESET_SENSOR, Observation, Preset, Stand, observe_from, sample_camera
 from simharness.sim.protocol import query_about
@@ -15,6 +16,7 @@ from simharness.sim.sensors.catalogue import D435, SENSORS, SensorName, random_s
 from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.sensors.stereo import Stereo
 from simharness.sim.world import World
+from tesnet import cloud
 from tesnet.calibration import calibrated
 from tesnet.geometry import Gripper, Pose
 from tesnet.query import GraspQuery
@@ -79,6 +81,14 @@ class Viewing:
         if self.shows == "open":
             query = replace(query, workspace=None)
         return calibrated(query)[0]
+
+    def look(
+        self, world: World, seed: int, gripper: Gripper, preparation: cloud.PreparationConfig
+    ) -> tuple[GraspQuery, cloud.PreparedCloud] | None:
+        """What is asked about a world, and its prepared cloud; None where that has too few points for any grasp."""
+        query = self.query(self.observe(world), seed, gripper)
+        prepared = cloud.prepare(query, preparation, torch.device("cpu"))
+        return None if prepared is None or len(prepared) < cloud.MINIMUM_POINTS else (query, prepared)
 
 
 @dataclass(frozen=True, slots=True)

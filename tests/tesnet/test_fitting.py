@@ -143,7 +143,7 @@ def test_what_lies_between_the_fingers_is_what_each_pose_by_itself_has_there(nam
     cloud = prepared(query)
     found, _ = generate(cloud, query, BY_RULES)
     near = contact_places(cloud, found)
-    rows, y, n = (part.numpy() for part in fitting._between_fingers(cloud, found.Ts_canonical_grasp, near, hand))
+    rows, y, n = (part.numpy() for part in fitting._between_fingers(cloud, found, near))
     points, normals = cloud.points.double().numpy(), cloud.normals.double().numpy()
     seen = 0
     for row, T in enumerate(found.Ts_canonical_grasp.double().numpy()):

@@ -144,7 +144,7 @@ def test_scenes_are_rendered_with_clouds_as_the_service_prepares_them(
     preparation = GraspPredictor.load(weights.default_weights()).preparation
     scene = archive._read_scene(next(path for path in scene_files([labels]) if load_scene(path)[1]))
     job = archive.SceneFile(replace(scene, views=scene.views[:1]), tmp_path / "scene_0.npz")
-    archive._render_scene(job, archive.models_by_kind("procedural-train")["packed"], MoreViews(), preparation)
+    archive._render_scene(job, archive._models_by_kind("procedural-train")["packed"], MoreViews(), preparation)
     (view,) = load_scene(tmp_path / "scene_0.npz")[1]
     served = prepare(queries[0], preparation, torch.device("cpu"))
     assert served is not None
@@ -263,7 +263,7 @@ def test_views_of_old_scenes_were_taken_from_the_recorded_cameras_where_their_vi
 
 def test_views_that_are_rendered_with_too_few_points_are_left_out_of_their_scene(labels: Path, tmp_path: Path) -> None:
     """As on a grid so coarse that small things have fewer points than the service answers."""
-    models = archive.models_by_kind("procedural-train")["packed"]
+    models = archive._models_by_kind("procedural-train")["packed"]
     scene = archive._read_scene(next(path for path in scene_files([labels]) if load_scene(path)[1]))
     labels_of_seed = {view.viewing.seed: len(view.outcomes) for view in scene.views}
     kept = []
