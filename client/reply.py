@@ -55,7 +55,7 @@ class Grasp:
         hand_pose: the pose of the hand's base link, open by `width`, in its own axes, whatever the convention.
         pregrasp: where to begin the straight approach.
         width: the opening to set before approaching.
-        approach_point: (3,) the point that the hand's centre line passes through.
+        approach_point: (3,) the point that the grasp was made from; the hand may stand beside it along y.
         contact_point: (3,) the point that one fingertip closes onto.
     """
 

@@ -317,7 +317,9 @@ class GraspOut(ResponsePart):
     )
     pregrasp: PoseOut = Field(description="TCP pose `pregrasp_distance` behind the grasp; Panda axes always.")
     width: float = Field(description="Opening to set before approaching, metres.")
-    approach_point: Vector = Field(description="Cloud point through which the hand's centre line passes, metres.")
+    approach_point: Vector = Field(
+        description="Cloud point that the grasp was made from, metres; the hand's middle may lie beside it along y."
+    )
     contact_point: Vector = Field(description="Cloud point on which one fingertip closes, metres.")
 
 
@@ -334,7 +336,9 @@ class ModelIdentity(ResponsePart):
 class RejectedOut(ResponsePart):
     """Candidates dropped by each step; one that several would drop counts at the first of them only."""
 
-    support: int = Field(description="The hand would come within 4 mm of the support plane.")
+    support: int = Field(
+        description="The hand would come too near to the support plane: within 4 mm, or 1.5 mm of thin things."
+    )
     from_below: int = Field(
         description="The hand would come from below or, without `up`, from behind what the camera sees."
     )

@@ -95,15 +95,15 @@ class Centring(nn.Module):
         return best
 
     @torch.no_grad()
-    def shifts(self, cloud: PreparedCloud, candidates: Candidates) -> Tensor:
+    def shifts(self, seen: Tensor, cloud: PreparedCloud, candidates: Candidates) -> Tensor:
         """(C,) metres along the closing direction from where each hand stands to where it should.
 
         Args:
+            seen: (C, SEEN), of `seen_between`.
             cloud: what was seen.
             candidates: whose tips are where they rest (`candidates.at_rest`).
         """
-        place = self.place(seen_between(cloud, candidates))
-        return contact_places(cloud, candidates) + place * place_unit(candidates.gripper)
+        return contact_places(cloud, candidates) + self.place(seen) * place_unit(candidates.gripper)
 
 
 def place_unit(hand: Gripper) -> float:
@@ -145,6 +145,18 @@ def seen_between(cloud: PreparedCloud, candidates: Candidates) -> Tensor:
     by_bin = torch.cat([count.clamp(max=_MOST_POINTS) / _MOST_POINTS, sums[:, 1:] / count.clamp(min=1)], dim=1)
     by_bin = torch.cat([by_bin, deepest[:, None]], dim=1).view(len(near), -1)
     return torch.cat([by_bin, _of_hand(cloud, candidates, near)], dim=1)
+
+
+def reaches(seen: Tensor, share: float) -> Tensor:
+    """(C,) whether something was seen farther from the contact point than a share of the opening, and within it.
+
+    Args:
+        seen: (C, SEEN), of `seen_between`.
+        share: of the widest opening.
+    """
+    slices = int(OPENING)  # two places thick each
+    counts = seen[:, : BINS * _BY_BIN : _BY_BIN]
+    return (counts[:, _BINS_PAST_CONTACT + int(share * slices) : _BINS_PAST_CONTACT + slices] > 0).any(dim=1)
 
 
 def _of_hand(cloud: PreparedCloud, candidates: Candidates, near: Tensor) -> Tensor:

@@ -25,7 +25,7 @@ from tesnet.candidates import (
 )
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
-from tesnet.outline import is_low
+from tesnet.outline import MOST_LEAN, is_low
 
 MARGIN = 0.008
 """Between each finger and the wall that it closes on, where that is seen."""
@@ -50,6 +50,9 @@ _LEAST_SPREAD = 0.02
 """Of the normals' components along the closing direction, as a variance: less, and they tell of no curve."""
 
 _FEWEST = 6
+
+_NEARLY_FULL = 0.9
+"""Of the opening: what fills more of it leaves fingers so little room that it must be measured where it can be."""
 
 _FARTHEST_UNSEEN = 0.02
 """No wall is taken to lie farther beyond what is seen."""
@@ -107,7 +110,8 @@ def fitted(
 def _to_middle(cloud: PreparedCloud, resting: Candidates, span: Span | None, learned: str | None) -> Tensor:
     """(C,) how far each hand moves along its closing direction to stand between its walls.
 
-    Of low things all sides show, so there the rules tell it best whatever was learned.
+    Of low things all sides show, so there the rules tell it best whatever was learned; and of things that nearly fill
+    the hand where the camera saw both ends.
 
     Args:
         cloud: what was seen.
@@ -119,12 +123,30 @@ def _to_middle(cloud: PreparedCloud, resting: Candidates, span: Span | None, lea
         by_rules = torch.ones_like(resting.approach, dtype=torch.bool)
         shift = resting.widths.new_zeros(len(resting))
     else:
+        seen = centring.seen_between(cloud, resting)
         by_rules = is_low(cloud)[resting.contact]
-        shift = centring.shipped(learned, resting.widths.device).shifts(cloud, resting)
+        full = centring.reaches(seen, _NEARLY_FULL) & ~by_rules
+        by_rules[full] = _nearly_fills(cloud, resting.select(full), None if span is None else span.select(full))
+        shift = centring.shipped(learned, resting.widths.device).shifts(seen, cloud, resting)
     if bool(by_rules.any()):
         rules = spans(cloud, resting.select(by_rules)) if span is None else span.select(by_rules)
         shift[by_rules] = (rules.near + rules.far) / 2
     return shift
+
+
+def _nearly_fills(cloud: PreparedCloud, resting: Candidates, span: Span | None) -> Tensor:
+    """Mask (C,) of hands that hardly pass beside what they close on, whose far end the camera saw, or the place beside.
+
+    Args:
+        cloud: what was seen.
+        resting: the candidates, their tips where they rest.
+        span: what lies between the fingers of all; None where it is not known.
+    """
+    span = spans(cloud, resting) if span is None else span
+    extent, opening = span.near - span.far, resting.gripper.max_width
+    sight = (cloud.view_directions[resting.approach][:, None] @ resting.Ts_canonical_grasp[:, :3, :3])[:, 0]
+    sees_past = sight[:, 1] <= MOST_LEAN * -sight[:, 2]
+    return (extent > _NEARLY_FULL * opening) & (extent <= opening) & (span.seen | sees_past)
 
 
 def reach_of_fitting(

@@ -18,6 +18,9 @@ from tesnet.query import NO_VIEWPOINT, GraspQuery, span
 _SAMPLE = 10_000
 """Posted points by which their extent, and the distance from one to the nearest other one, are measured."""
 
+NARROWEST = 0.03
+"""Metres; no hand that the network learned with opens less."""
+
 COARSEST_RESOLUTION = 0.0005
 """Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""
 
@@ -31,6 +34,11 @@ def of_query(query: GraspQuery, *, knows_hands: bool) -> list[str]:
         notes.append("up not given: grasps from below are not filtered, only those that come from behind what is seen")
     if query.gripper != PANDA and not knows_hands:
         notes.append("gripper is not the hand that the network was trained with: only collision and width follow it")
+    if query.gripper.max_width < NARROWEST and knows_hands:
+        notes.append(
+            f"gripper opens {query.gripper.max_width:g} m, less than any that the network was trained with "
+            f"({NARROWEST:g} m): scores are rough, and points are seen no finer than a few millimetres"
+        )
     return notes
 
 

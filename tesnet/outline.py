@@ -1,4 +1,4 @@
-"""The outline of faces that a camera sees from straight above: where a face ends and its walls are not seen.
+"""The outline of faces: where a face ends, its wall is not seen, and the camera sees past the edge straight down.
 
 Knows no hand and no candidate. Vectorised torch; lengths in metres; everything in the cloud's canonical frame.
 """
@@ -17,8 +17,8 @@ from tesnet.points import smallest_eigenvector
 from tesnet.query import GraspQuery
 from tesnet.ranges import RangeImage, range_image
 
-_STEEPEST_SIGHT = math.cos(math.radians(20))
-"""Faces are seen from straight above where the direction of view is this near to `up`."""
+MOST_LEAN = math.tan(math.radians(20))
+"""Across an edge the line of sight leans no farther off the travel: beside it a finger's place is seen, and no wall."""
 
 _FLATTEST = 0.8
 """Faces lie across the travel: the cosine of their normal with its opposite is more."""
@@ -87,13 +87,12 @@ def outline(cloud: PreparedCloud, query: GraspQuery) -> Outline:
     """
     travel = -(cloud.view_directions if cloud.up is None else cloud.up.expand_as(cloud.points))
     ends = _Ends.of(cloud, travel)
-    is_edge = ends.one_sided & ((cloud.normals * -travel).sum(dim=1) > _FLATTEST)
-    if cloud.up is not None:
-        is_edge &= (cloud.view_directions @ cloud.up >= _STEEPEST_SIGHT) | is_low(cloud)
-    found = is_edge.nonzero()[:, 0]
+    found = (ends.one_sided & ((cloud.normals * -travel).sum(dim=1) > _FLATTEST)).nonzero()[:, 0]
     outward = _across_line(ends.level[found], ends.on_edge_of(cloud, found), ends.outward[found], travel[found])
     walls = (cloud.normals[cloud.neighbours[found]] * outward[:, None]).sum(dim=2) > _WALL
-    ends_in_air = ~walls.any(dim=1)
+    sight = cloud.view_directions[found]
+    lean, drop = (sight * outward).sum(dim=1), (sight * -travel[found]).sum(dim=1)
+    ends_in_air = ~walls.any(dim=1) & ((lean.abs() <= MOST_LEAN * drop) | is_low(cloud)[found])
     found, outward = found[ends_in_air], outward[ends_in_air]
     if len(found):
         away = _falls_away(cloud, query, found, outward)

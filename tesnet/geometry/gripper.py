@@ -97,13 +97,23 @@ class Gripper:
                 f"finger_depth is {self.finger_depth}; it must exceed {self.tip_offset + PALM_OVERLAP:g} m, or the "
                 "palm would lie between the pads"
             )
-        if self.linkage_length is not None:
-            reach = max(abs(self.max_width / 2 - self.linkage_offset), abs(self.linkage_offset))
-            if not reach < self.linkage_length:
+        self._check_linkage()
+
+    def _check_linkage(self) -> None:
+        length, offset = self.linkage_length, self.linkage_offset
+        if length is None:
+            if offset:
                 raise ValueError(
-                    f"linkage_length is {self.linkage_length}; it must exceed {reach:g} m, how far the pads swing to "
-                    "a side with this max_width and linkage_offset"
+                    f"linkage_offset is {offset}; it needs linkage_length, the length of the cranks in metres"
                 )
+            return
+        if not abs(offset) < length:
+            raise ValueError(f"linkage_offset is {offset}; it must be nearer to 0 than linkage_length, {length} m")
+        if not self.max_width < 2 * (length + offset):
+            raise ValueError(
+                f"max_width is {self.max_width}; cranks with linkage_length {length} and linkage_offset {offset} open "
+                f"less than {2 * (length + offset):g} m; give a smaller opening or longer cranks"
+            )
 
     # Factories
 
@@ -111,7 +121,8 @@ class Gripper:
         """A hand that differs from this one in the sizes given, by their names; it has no name.
 
         A part whose size is given is straight, unless its tapered end is given as well; a taper that would be longer
-        than its part is cut. Where cranks open less, the base link stays where it is: `hand_to_tcp` follows.
+        than its part is cut. Where cranks open less, the base link stays where it is as they close to the same width:
+        `hand_to_tcp` follows, unless it is given.
 
         Raises:
             ValueError: as for any `Gripper`.
@@ -120,9 +131,12 @@ class Gripper:
         for whole, end in _TAPERED.items():
             if whole in given:
                 given.setdefault(end, given[whole])
-        if "max_width" in given and self.linkage_length and given["max_width"] <= self.max_width:
-            given.setdefault("hand_to_tcp", self.tcp_at(given["max_width"]))
         hand = replace(self, **given, name=None)
+        reaches = hand.linkage_length and self.max_width < 2 * (hand.linkage_length + hand.linkage_offset)
+        if self.linkage_length and reaches and hand.max_width <= self.max_width and "hand_to_tcp" not in given:
+            hand = replace(
+                hand, hand_to_tcp=hand.hand_to_tcp + _rise(hand, hand.max_width) - _rise(hand, self.max_width)
+            )
         return replace(
             hand,
             finger_taper=min(hand.finger_taper, hand.finger_length),
@@ -184,11 +198,7 @@ class Gripper:
         """
         if self.linkage_length is None:
             return self.hand_to_tcp
-        return self.hand_to_tcp + self._rise(width) - self._rise(self.max_width)
-
-    def _rise(self, width: Any) -> Any:
-        assert self.linkage_length is not None
-        return (self.linkage_length**2 - (width / 2 - self.linkage_offset) ** 2) ** 0.5
+        return self.hand_to_tcp + _rise(self, width) - _rise(self, self.max_width)
 
     def T_grasp_hand(self, width: float) -> Pose:
         """Pose of the hand's base link in the grasp frame of the hand open by `width`."""
@@ -203,6 +213,12 @@ class Gripper:
             width: the opening between the pads, metres.
         """
         return np.concatenate([part.corners(width) for part in self.parts])
+
+
+def _rise(hand: Gripper, width: Any) -> Any:
+    """Metres from the joints of the hand's cranks to their ends, along z, as the hand is open by `width`."""
+    assert hand.linkage_length is not None
+    return (hand.linkage_length**2 - (width / 2 - hand.linkage_offset) ** 2) ** 0.5
 
 
 PANDA = Gripper(name="franka")

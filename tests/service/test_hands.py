@@ -149,7 +149,7 @@ def test_sizes_have_the_same_names_everywhere() -> None:
     [
         ("robotiq_2f80", "did you mean robotiq_2f85.*valid: franka, .*or give its sizes"),
         (GripperSize(name="nobody's"), "no known hand.*valid"),
-        (GripperSize(name="ag95", linkage_length=0.02), r"linkage_length is 0\.02; it must exceed"),
+        (GripperSize(name="ag95", linkage_length=0.02), r"max_width is 0\.095; cranks .* open less than 0\.057 m"),
     ],
 )
 def test_a_hand_that_cannot_be_is_refused(option: Any, words: str) -> None:

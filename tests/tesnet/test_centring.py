@@ -15,6 +15,7 @@ from tesnet.errors import WeightsError
 from tesnet.geometry import PANDA, Gripper
 from tesnet.hands import HANDS
 from tesnet.predictor import GraspPredictor
+from tesnet.query import GraspQuery
 from tesnet.search import search
 from tests.tesnet.scenes import UP, Array, ask, prepared, tabletop_query
 
@@ -56,6 +57,40 @@ def test_fingers_pass_on_both_sides_of_a_can_whose_far_side_is_not_seen(radius: 
     assert len(rooms[1]) > 30
     assert learned > 0.9
     assert learned >= by_rules
+
+
+def bar(hand: Gripper, share: float, *, walls: bool) -> GraspQuery:
+    """A bar along x, 6 cm high: its top and both its long sides, or its top alone, from straight above.
+
+    It fills a share of the opening.
+    """
+    rng, width = np.random.default_rng(0), share * hand.max_width
+    points = [
+        np.column_stack([rng.uniform(-0.06, 0.06, 9000), rng.uniform(-width / 2, width / 2, 9000), np.full(9000, 0.06)])
+    ]
+    viewpoints = [[0.0, 0.0, 0.6]]
+    if walls:
+        viewpoints = [[0.0, 0.5, 0.5], [0.0, -0.5, 0.5]]
+        for side in (-width / 2, width / 2):
+            rise = rng.uniform(0.006, 0.06, 9000)
+            points.append(np.column_stack([rng.uniform(-0.06, 0.06, 9000), np.full(9000, side), rise]))
+    posted = np.concatenate(points)
+    return ask(posted, viewpoints=viewpoints, up=UP, support_height=0.0, gripper=hand, num_approach_points=128)
+
+
+@pytest.mark.parametrize("walls", [True, False])
+@pytest.mark.parametrize("name", ["franka", "rg2", "robotiq_2f140"])
+def test_what_fills_the_hand_stands_midway_where_both_its_ends_were_seen(name: str, walls: bool) -> None:
+    """With 1 to 2 mm left beside each finger."""
+    hand = HANDS[name].gripper
+    query = bar(hand, 0.97, walls=walls)
+    cloud = prepared(query)
+    searched = search(cloud, query, CandidateConfig())
+    found = searched.candidates.select(searched.is_free)
+    Ts = cloud.T_cloud_canonical.matrix @ found.Ts_canonical_grasp.double().numpy()
+    across = (np.abs(Ts[:, 1, 1]) > 0.99) & (Ts[:, 2, 2] < -0.99)
+    assert across.sum() > 20
+    assert (np.abs(Ts[across, 1, 3]) < 0.015 * hand.max_width).mean() > 0.9
 
 
 @pytest.mark.parametrize("name", ["franka", "rg2", "wsg50"])

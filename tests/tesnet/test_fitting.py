@@ -289,7 +289,7 @@ def test_hands_on_low_things_go_by_rules_whatever_was_learned(policy: Literal["f
     shift = fitting._to_middle(cloud, resting, span if policy == "fitted" else None, "1")
     rules = (span.near + span.far) / 2
     torch.testing.assert_close(shift[low], rules[low])
-    learned = centring.shipped("1", torch.device("cpu")).shifts(cloud, resting)
+    learned = centring.shipped("1", torch.device("cpu")).shifts(centring.seen_between(cloud, resting), cloud, resting)
     torch.testing.assert_close(shift[~low], learned[~low])
     assert float((learned - rules).abs().median()) > 1e-4
     placed = fitting.fitted(cloud, found, replace(BY_RULES, centring="1"), policy=policy)

@@ -218,15 +218,25 @@ def test_a_hand_of_other_sizes_has_no_name() -> None:
     assert PANDA.with_sizes(robotiq.sizes()) == robotiq
     assert robotiq.sizes()["linkage_length"] == 0.05715
     limited = robotiq.with_sizes({"max_width": 0.04})
-    assert limited.hand_to_tcp == robotiq.tcp_at(0.04)
+    assert limited.hand_to_tcp == pytest.approx(robotiq.tcp_at(0.04))
     assert limited.tcp_at(0.02) == pytest.approx(robotiq.tcp_at(0.02))
+    rg2 = HANDS["rg2"].gripper
+    other = {"linkage_length": 0.08}
+    both = rg2.with_sizes(other | {"max_width": 0.05})
+    assert both.tcp_at(0.03) == pytest.approx(rg2.with_sizes(other).tcp_at(0.03))
+    assert rg2.with_sizes({"max_width": 0.05, "hand_to_tcp": 0.2}).hand_to_tcp == 0.2
+    assert (
+        rg2.with_sizes({"max_width": 0.05, "linkage_length": 0.03}).hand_to_tcp == rg2.hand_to_tcp
+    )  # too short for both
 
 
 @pytest.mark.parametrize(
     ("sizes", "words"),
     [
-        ({"linkage_length": 0.03}, r"linkage_length is 0\.03; it must exceed 0\.04"),
-        ({"linkage_length": 0.06, "linkage_offset": -0.03}, r"must exceed 0\.07"),
+        ({"linkage_length": 0.03}, r"max_width is 0\.08; cranks .* open less than 0\.06 m"),
+        ({"linkage_length": 0.06, "linkage_offset": -0.03}, r"open less than 0\.06 m"),
+        ({"linkage_length": 0.06, "linkage_offset": 0.06}, r"linkage_offset is 0\.06; it must be nearer to 0"),
+        ({"linkage_offset": 0.02}, r"linkage_offset is 0\.02; it needs linkage_length"),
         ({"linkage_length": -0.1}, r"linkage_length is -0\.1"),
         ({"hand_to_tcp": 0.0}, r"hand_to_tcp is 0"),
     ],

@@ -121,8 +121,19 @@ def test_a_plane_that_the_caller_removed_lies_beyond_an_edge_where_it_is_known(s
 def test_a_view_from_the_side_has_no_outline() -> None:
     query = tabletop_query()
     assert len(outline(prepared(query), query).points) == 0
-    aslant = overhead_query((LONG,), camera=np.array([[0.3, 0.1, 0.5]]))
+    aslant = overhead_query((LONG,), camera=np.array([[0.35, 0.3, 0.5]]))
     assert len(outline(prepared(aslant), aslant).points) == 0
+
+
+@pytest.mark.parametrize("aside", [0.0, 0.06])
+def test_seen_from_its_end_a_long_box_ends_along_its_sides(aside: float) -> None:
+    points, outward, travel, _ = outlined(overhead_query((LONG,), camera=np.array([[0.45, aside, 0.45]])))
+    assert len(points) > 10
+    assert (np.abs(outward[:, 1]) > 0.9).mean() > 0.9
+    np.testing.assert_allclose(np.abs(points[np.abs(outward[:, 1]) > 0.9, 1]), 0.025, atol=1.2 * CELL)
+    assert {-1.0, 1.0} >= set(np.sign(outward[:, 1]))
+    assert (outward[:, 1] < -0.9).any()  # where nobody sees the wall
+    np.testing.assert_allclose(travel, np.tile(-UP, (len(points), 1)), atol=1e-6)
 
 
 def test_edges_whose_wall_is_seen_are_left_to_the_pairs_with_that_wall() -> None:
