@@ -257,7 +257,8 @@ def _support_noise(
     """
     if support is not None:
         clearance = torch.from_numpy(support.clearance(points[:, :3].cpu().numpy())).to(points)
-        reach = clearance.clamp(min=SUPPORT_NOISE) if bool((clearance > SUPPORT_NOISE).any()) else SUPPORT_NOISE
+        most = float(clearance.max()) if len(clearance) else 0.0
+        reach = clearance if most > SUPPORT_NOISE else most
         return reach, 0.0 if config.smooth_above is None else support.noise_sd
     known = _heights(points, query)
     if known is None or config.smooth_above is None:

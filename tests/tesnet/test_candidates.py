@@ -158,8 +158,10 @@ def assert_within_limits(cloud_: cloud.PreparedCloud, found: Candidates) -> None
 
 @pytest.mark.parametrize("seed", range(3))
 def test_no_candidate_breaks_a_limit_of_the_conventions(seed: int, monkeypatch: pytest.MonkeyPatch) -> None:
-    """Those of low things aside, which have limits of their own."""
+    """Those of low things and of outlines aside, which have limits of their own."""
     monkeypatch.setattr(candidates, "is_low", lambda some: torch.zeros(len(some), dtype=torch.bool))
+    nothing = Outline(torch.empty(0, dtype=torch.long), torch.empty(0, 3), torch.empty(0, 3))
+    monkeypatch.setattr(candidates, "outline", lambda *_: nothing)
     found, _ = generate({"max_candidates": 20_000}, seed)
     assert len(found) > 500
     assert_within_limits(ready(seed), found)

@@ -12,7 +12,7 @@ from numpy.typing import NDArray
 from scipy.spatial import cKDTree
 from torch import Tensor
 
-from tesnet import cloud, smoothing
+from tesnet import cloud, smoothing, support
 from tesnet.depth_noise import DepthNoise
 from tesnet.geometry import Box, Pose
 from tesnet.query import GraspQuery
@@ -226,7 +226,7 @@ def test_the_canonical_frame_is_one_however_far_and_small_the_cloud_is(
 
 @pytest.mark.parametrize("noise_sd", [0.0, 0.001, 0.003, 0.006])
 def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: float) -> None:
-    """Whether grasps are looked for there or not; a plane of little noise keeps the usual distance."""
+    """Whether grasps are looked for there or not; of a plane of little noise 3 mm are dropped."""
     points = np.random.default_rng(0).uniform([-0.06, -0.06, 0.0], [0.06, 0.06, 0.06], (20_000, 3))
     sides = np.array([[1.0, 0, 0, 0.2], [-1.0, 0, 0, 0.2], [0, 1.0, 0, 0.2], [0, -1.0, 0, 0.2]])
     plane = SupportPlane(UP, 0.0, 0.5, 0.1, noise_sd, sides, DepthNoise(CAMERA[None], noise_sd, 0.0))
@@ -235,7 +235,7 @@ def test_what_is_as_low_as_a_found_supports_noise_is_dropped_with_it(noise_sd: f
     assert ready is not None
     positions = [ready.points] if ready.unsought is None else [ready.points, ready.unsought.points]
     heights = ready.T_cloud_canonical.apply(torch.cat(positions).numpy())[:, 2]
-    lowest = max(cloud.SUPPORT_NOISE, 4 * noise_sd)
+    lowest = max(support.LOWEST, 4 * noise_sd)
     assert lowest - 1e-6 <= heights.min() < lowest + 0.003
     assert ready.support_error == noise_sd
 

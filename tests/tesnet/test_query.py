@@ -1,5 +1,6 @@
 from __future__ import annotations
 
+import itertools
 import re
 from dataclasses import replace
 from typing import Any
@@ -252,8 +253,7 @@ def test_a_hand_opens_wide_unless_its_tips_swing_as_they_close(name: str) -> Non
         assert ask(POINTS, gripper=hand, width=asked).opening_policy == asked
 
 
-@pytest.mark.parametrize("offset", [-0.03, 0.0, 0.02])
-@pytest.mark.parametrize("length", [None, 0.08, 0.2])
+@pytest.mark.parametrize(("offset", "length"), [(0.0, None), *itertools.product([-0.03, 0.0, 0.02], [0.08, 0.2])])
 def test_a_hand_of_one_s_own_swings_if_it_has_cranks_wherever_their_pivots_stand(
     offset: float, length: float | None
 ) -> None:
