@@ -46,3 +46,18 @@ def test_nothing_is_found_where_nothing_is_a_candidate() -> None:
     found = search(cloud, query, CandidateConfig(min_depth=1.0, max_depth=0.5))
     assert len(found.candidates) == len(found.is_free) == 0
     assert found.rejected["collision"] == 0
+
+
+def test_hands_go_by_rules_where_the_camera_s_pose_is_in_doubt() -> None:
+    query = tabletop_query(max_candidates=200)
+    cloud = prepared(query)
+    learned, doubted, by_rules = (
+        search(cloud, asked, config).candidates.Ts_canonical_grasp
+        for asked, config in (
+            (query, CandidateConfig()),
+            (query.but(calibrate=True), CandidateConfig()),
+            (query, CandidateConfig(centring=None)),
+        )
+    )
+    assert torch.equal(doubted, by_rules)
+    assert not torch.equal(learned, by_rules)
