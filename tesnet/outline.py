@@ -17,6 +17,9 @@ from tesnet.points import smallest_eigenvector
 from tesnet.query import GraspQuery
 from tesnet.ranges import RangeImage, range_image
 
+_STEEPEST = math.cos(math.radians(20))
+"""Faces are seen from straight above where the direction of view is this near to `up`."""
+
 MOST_LEAN = math.tan(math.radians(20))
 """Across an edge the line of sight leans no farther off the travel: beside it a finger's place is seen, and no wall."""
 
@@ -83,7 +86,8 @@ def outline(cloud: PreparedCloud, query: GraspQuery) -> Outline:
     What lies beyond is looked up in all posted points, not in the prepared ones, so a face that the workspace or the
     cell limit cuts does not end there. Where no point was posted beyond, the image may have ended: such an edge counts
     only where a support plane is known whose own points the caller has removed, and not at a side of the workspace.
-    What such a caller's image cut off cannot be told from an edge.
+    What such a caller's image cut off cannot be told from an edge. Who asks for `calibrate` doubts where the camera
+    stands: there faces have an outline only where they are seen from straight above.
     """
     travel = -(cloud.view_directions if cloud.up is None else cloud.up.expand_as(cloud.points))
     ends = _Ends.of(cloud, travel)
@@ -92,7 +96,8 @@ def outline(cloud: PreparedCloud, query: GraspQuery) -> Outline:
     walls = (cloud.normals[cloud.neighbours[found]] * outward[:, None]).sum(dim=2) > _WALL
     sight = cloud.view_directions[found]
     lean, drop = (sight * outward).sum(dim=1), (sight * -travel[found]).sum(dim=1)
-    ends_in_air = ~walls.any(dim=1) & ((lean.abs() <= MOST_LEAN * drop) | is_low(cloud)[found])
+    seen_past = (lean.abs() <= MOST_LEAN * drop) & (drop >= (_STEEPEST if query.calibrate else 0.0))
+    ends_in_air = ~walls.any(dim=1) & (seen_past | is_low(cloud)[found])
     found, outward = found[ends_in_air], outward[ends_in_air]
     if len(found):
         away = _falls_away(cloud, query, found, outward)

@@ -125,6 +125,12 @@ def test_a_view_from_the_side_has_no_outline() -> None:
     assert len(outline(prepared(aslant), aslant).points) == 0
 
 
+def test_where_the_camera_s_pose_is_in_doubt_faces_have_an_outline_from_straight_above_alone() -> None:
+    for camera, some in ((np.array([[0.45, 0.0, 0.45]]), False), (OVERHEAD, True)):
+        query = overhead_query((LONG,), camera=camera, calibrate=True)
+        assert (len(outline(prepared(query), query).points) > 0) == some
+
+
 @pytest.mark.parametrize("aside", [0.0, 0.06])
 def test_seen_from_its_end_a_long_box_ends_along_its_sides(aside: float) -> None:
     points, outward, travel, _ = outlined(overhead_query((LONG,), camera=np.array([[0.45, aside, 0.45]])))
