@@ -119,6 +119,10 @@ def _to_middle(cloud: PreparedCloud, resting: Candidates, span: Span | None, lea
         span: what lies between the fingers of all; None where it is known of none.
         learned: version of what has learned it; None for the rules alone.
     """
+
+    def spans_of(rows: Tensor) -> Span:
+        return spans(cloud, resting.select(rows)) if span is None else span.select(rows)
+
     if learned is None:
         by_rules = torch.ones_like(resting.approach, dtype=torch.bool)
         shift = resting.widths.new_zeros(len(resting))
@@ -126,23 +130,22 @@ def _to_middle(cloud: PreparedCloud, resting: Candidates, span: Span | None, lea
         seen = centring.seen_between(cloud, resting)
         by_rules = is_low(cloud)[resting.contact]
         full = centring.reaches(seen, _NEARLY_FULL) & ~by_rules
-        by_rules[full] = _nearly_fills(cloud, resting.select(full), None if span is None else span.select(full))
+        by_rules[full] = _nearly_fills(cloud, resting.select(full), spans_of(full))
         shift = centring.shipped(learned, resting.widths.device).shifts(seen, cloud, resting)
     if bool(by_rules.any()):
-        rules = spans(cloud, resting.select(by_rules)) if span is None else span.select(by_rules)
+        rules = spans_of(by_rules)
         shift[by_rules] = (rules.near + rules.far) / 2
     return shift
 
 
-def _nearly_fills(cloud: PreparedCloud, resting: Candidates, span: Span | None) -> Tensor:
+def _nearly_fills(cloud: PreparedCloud, resting: Candidates, span: Span) -> Tensor:
     """Mask (C,) of hands that hardly pass beside what they close on, whose far end the camera saw, or the place beside.
 
     Args:
         cloud: what was seen.
         resting: the candidates, their tips where they rest.
-        span: what lies between the fingers of all; None where it is not known.
+        span: what lies between the fingers of each.
     """
-    span = spans(cloud, resting) if span is None else span
     extent, opening = span.near - span.far, resting.gripper.max_width
     sight = (cloud.view_directions[resting.approach][:, None] @ resting.Ts_canonical_grasp[:, :3, :3])[:, 0]
     sees_past = sight[:, 1] <= MOST_LEAN * -sight[:, 2]

@@ -10,16 +10,13 @@ import torch
 
 from tesnet import plausibility
 from tesnet.cloud import MINIMUM_POINTS, PreparationConfig, PreparedCloud
-from tesnet.geometry import PANDA, Box
+from tesnet.geometry import NARROWEST, PANDA, Box
 from tesnet.planes import spread
 from tesnet.points import nearest_neighbours
 from tesnet.query import NO_VIEWPOINT, GraspQuery, span
 
 _SAMPLE = 10_000
 """Posted points by which their extent, and the distance from one to the nearest other one, are measured."""
-
-NARROWEST = 0.03
-"""Metres; no hand that the network learned with opens less."""
 
 COARSEST_RESOLUTION = 0.0005
 """Points whose coordinates float32 resolves no finer than this, in metres, are answered with a warning."""

@@ -6,7 +6,7 @@ import math
 
 import numpy as np
 
-from tesnet.geometry import Gripper
+from tesnet.geometry import NARROWEST, WIDEST, Gripper
 from tesnet.hands import HANDS, KnownHand
 
 RANDOM = "random"
@@ -44,7 +44,7 @@ def alike(one: Gripper, other: Gripper) -> bool:
 
 
 def _draw(rng: np.random.Generator) -> Gripper:
-    width = rng.uniform(0.03, 0.16)
+    width = rng.uniform(NARROWEST, WIDEST)
     finger_depth = float(np.clip((0.030 + 0.21 * width) * rng.lognormal(0.0, 0.2), 0.030, 0.085))
     thickness = float(np.clip((0.010 + 0.13 * width) * rng.lognormal(0.0, 0.3), 0.008, 0.040))
     breadth = float(np.clip(0.022 * rng.lognormal(0.0, 0.22), 0.012, 0.036))

@@ -3,12 +3,13 @@
 from tesnet.geometry.box import Box
 from tesnet.geometry.camera import CameraIntrinsics
 from tesnet.geometry.grasp import FRAME_CONVENTIONS, FrameConvention, GraspSet
-from tesnet.geometry.gripper import PANDA, WIDEST, Gripper
+from tesnet.geometry.gripper import NARROWEST, PANDA, WIDEST, Gripper
 from tesnet.geometry.part import Extent, Part, PartName, Section
 from tesnet.geometry.pose import Pose, quaternions_xyzw, unit
 
 __all__ = [
     "FRAME_CONVENTIONS",
+    "NARROWEST",
     "PANDA",
     "WIDEST",
     "Box",

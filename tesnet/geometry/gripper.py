@@ -14,7 +14,10 @@ from tesnet.geometry.part import Extent, Part
 from tesnet.geometry.pose import Pose
 
 WIDEST = 0.16
-"""Metres: the largest opening of any hand that is served."""
+"""Metres: the largest opening of any hand that is served, or trained with."""
+
+NARROWEST = 0.03
+"""Metres: the largest opening of the smallest hand that is trained with."""
 
 PALM_OVERLAP = 0.004
 """Metres of the usable finger depth that the hand's body covers."""
@@ -109,10 +112,10 @@ class Gripper:
             return
         if not abs(offset) < length:
             raise ValueError(f"linkage_offset is {offset}; it must be nearer to 0 than linkage_length, {length} m")
-        if not self.max_width < 2 * (length + offset):
+        if not self.max_width < self.reach_of_cranks:
             raise ValueError(
                 f"max_width is {self.max_width}; cranks with linkage_length {length} and linkage_offset {offset} open "
-                f"less than {2 * (length + offset):g} m; give a smaller opening or longer cranks"
+                f"less than {self.reach_of_cranks:g} m; give a smaller opening or longer cranks"
             )
 
     # Factories
@@ -132,8 +135,9 @@ class Gripper:
             if whole in given:
                 given.setdefault(end, given[whole])
         hand = replace(self, **given, name=None)
-        reaches = hand.linkage_length and self.max_width < 2 * (hand.linkage_length + hand.linkage_offset)
-        if self.linkage_length and reaches and hand.max_width <= self.max_width and "hand_to_tcp" not in given:
+        both_swing = self.linkage_length is not None and hand.linkage_length is not None
+        opens_less = hand.max_width <= self.max_width < hand.reach_of_cranks
+        if both_swing and opens_less and "hand_to_tcp" not in given:
             hand = replace(
                 hand, hand_to_tcp=hand.hand_to_tcp + _rise(hand, hand.max_width) - _rise(hand, self.max_width)
             )
@@ -177,6 +181,11 @@ class Gripper:
                 Extent.constant(self.palm_length),
             ),
         )
+
+    @property
+    def reach_of_cranks(self) -> float:
+        """Metres that the hand's cranks open less than; infinite where the fingers slide."""
+        return math.inf if self.linkage_length is None else 2 * (self.linkage_length + self.linkage_offset)
 
     @property
     def travel(self) -> float:

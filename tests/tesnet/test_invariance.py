@@ -134,10 +134,12 @@ def test_grasps_move_with_the_scene() -> None:
     expected = np.hstack([motion.apply(part) for part in np.hsplit(pairs, 2)])
     distance, where = cKDTree(others).query(expected)
     assert distance.max() < 1e-5
-    np.testing.assert_allclose(moved.scores[where], still.scores, atol=5e-3)
     apart = np.linalg.inv(motion.matrix @ still.Ts_cloud_grasp) @ moved.Ts_cloud_grasp[where] - np.eye(4)
     aside = np.abs(apart[:, 1, 3])  # where a point enters another slice, the hand moves a little as it closes
     assert aside.max() < 0.002
-    assert np.mean(aside < 1e-4) > 0.7
+    stays = aside < 1e-4
+    assert np.mean(stays) > 0.7
+    np.testing.assert_allclose(moved.scores[where], still.scores, atol=5e-3)
+    np.testing.assert_allclose(moved.scores[where][stays], still.scores[stays], atol=1e-3)
     apart[:, 1, 3] = 0.0
     np.testing.assert_allclose(apart, 0.0, atol=1e-4)
