@@ -11,7 +11,7 @@ from dataclasses import dataclass
 
 import numpy as np
 
-from simharness.sim.shapes import extremes, flat, novel, training, wide
+from simharness.sim.shapes import extremes, flat, novel, slopes, training, wide
 from simharness.sim.solids import Body, GeneratedObject, centred
 
 
@@ -54,6 +54,7 @@ SETS: Mapping[str, MadeSet] = {
     for made in (
         MadeSet("shapes-train", training.VERSION, training.FAMILIES, 40),
         MadeSet("extremes-train", extremes.VERSION, extremes.FAMILIES, 40, sized=True),
+        MadeSet("slopes-train", slopes.VERSION, slopes.FAMILIES, 60),
         MadeSet("novel", novel.VERSION, novel.FAMILIES, 21),
         MadeSet("flat", flat.VERSION, flat.FAMILIES, 10, sized=True),
         MadeSet("wide", wide.VERSION, wide.FAMILIES, 10, sized=True),

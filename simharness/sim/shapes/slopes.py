@@ -1,0 +1,109 @@
+"""Families whose faces lean, so that fingers slide off them or hold them, as it happens: `slopes-train`.
+
+Few of their faces are parallel. Most are wider than the hand and have an edge or an end that it reaches around.
+"""
+
+from __future__ import annotations
+
+from collections.abc import Callable, Mapping
+
+import numpy as np
+
+from simharness.sim.shapes.elements import turned
+from simharness.sim.solids import Array, Body, Mesh, any_colour, at_height, loft, solid
+
+VERSION = 1
+
+
+def _wedge(rng: np.random.Generator) -> list[Body]:
+    """A bar of three or four faces that narrows along its length: roofs, keels, axe heads."""
+    return [solid([_bar(rng, rng.uniform(0.06, 0.14), rng.uniform(0.018, 0.055))], any_colour(rng))]
+
+
+def _shard(rng: np.random.Generator) -> list[Body]:
+    """An oblique pyramid over any convex outline, its tip cut off or nearly whole."""
+    return [solid([_pyramid(rng, rng.uniform(0.028, 0.065), rng.uniform(0.035, 0.11))], any_colour(rng))]
+
+
+def _rock(rng: np.random.Generator) -> list[Body]:
+    """A ball cut into few faces, its layers pushed aside."""
+    return [solid([_pebble(rng, rng.uniform(0.025, 0.06))], any_colour(rng))]
+
+
+def _bundle(rng: np.random.Generator) -> list[Body]:
+    """Two or three wedges, shards and rocks that have grown into each other."""
+    bodies = []
+    for number in range(int(rng.integers(2, 4))):
+        size = rng.uniform(0.016, 0.042)
+        kind = int(rng.integers(3))
+        if kind == 0:
+            part = _bar(rng, size * rng.uniform(2.0, 4.0), size * 0.8)
+        else:
+            part = _pyramid(rng, size, size * rng.uniform(1.2, 2.4)) if kind == 1 else _pebble(rng, size)
+        offset = _direction(rng) * size * rng.uniform(0.5, 0.9) if number else np.zeros(3)
+        bodies.append(solid([_tumbled(rng, part, offset)], any_colour(rng)))
+    return bodies
+
+
+def _ridge(rng: np.random.Generator) -> list[Body]:
+    """A plate that carries one to three blades."""
+    outline, thick = _outline(rng, 4, 8) * rng.uniform(0.04, 0.065), rng.uniform(0.006, 0.02)
+    bodies = [solid([loft([at_height(outline, 0.0), at_height(outline * 0.96, thick)])], any_colour(rng))]
+    for _ in range(int(rng.integers(1, 4))):
+        foot, length, height = rng.uniform(0.006, 0.022), rng.uniform(0.012, 0.036), rng.uniform(0.018, 0.06)
+        base = np.array([(-length, -foot), (length, -foot), (length, foot), (-length, foot)])
+        lean = rng.uniform(-0.5, 0.5, 2) * (length, foot)
+        top = base * (rng.uniform(0.4, 1.0), rng.uniform(0.05, 0.6)) + lean
+        blade = loft([at_height(base, thick - 0.001), at_height(top, thick + height)])
+        place = rng.uniform(-0.02, 0.02, 2)
+        bodies.append(solid([turned(blade, rng.uniform(0, np.pi), (*place, 0.0))], any_colour(rng)))
+    return bodies
+
+
+def _bar(rng: np.random.Generator, length: float, size: float) -> Mesh:
+    section = _outline(rng, 3, 4) * size
+    far = section * rng.uniform(0.25, 1.0) + rng.uniform(-0.4, 0.4, 2) * size
+    return loft([np.column_stack([np.full(len(ring), x), ring]) for x, ring in ((0.0, section), (length, far))])
+
+
+def _pyramid(rng: np.random.Generator, size: float, height: float) -> Mesh:
+    outline = _outline(rng, 3, 7) * size
+    top = outline * rng.uniform(0.05, 0.75) + rng.uniform(-0.5, 0.5, 2) * size
+    return loft([at_height(outline, 0.0), at_height(top, height)])
+
+
+def _pebble(rng: np.random.Generator, size: float) -> Mesh:
+    outline, lean = _outline(rng, 4, 8), rng.uniform(-0.5, 0.5, 2)
+    turns = np.sort(rng.uniform(-1.3, 1.3, 5)) + np.linspace(-0.1, 0.1, 5)
+    high = size * rng.uniform(0.5, 1.2)
+    rings = [outline * size * np.cos(turn) + lean * high * np.sin(turn) for turn in turns]
+    return loft([at_height(ring, high * np.sin(turn)) for ring, turn in zip(rings, turns, strict=True)])
+
+
+def _outline(rng: np.random.Generator, fewest: int, most: int) -> Array:
+    """A convex outline (K, 2) around the origin, counter-clockwise, its corners on an oval of half width 1."""
+    corners = int(rng.integers(fewest, most + 1))
+    angles = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.2, 0.2, corners)) / corners
+    turn = rng.uniform(0, 2 * np.pi)
+    return np.column_stack([np.cos(angles + turn), np.sin(angles + turn) * rng.uniform(0.5, 1.0)])
+
+
+def _direction(rng: np.random.Generator) -> Array:
+    vector = rng.standard_normal(3)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
+def _tumbled(rng: np.random.Generator, mesh: Mesh, offset: Array) -> Mesh:
+    """A mesh turned anyhow about its centroid, which then lies at the offset."""
+    turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
+    turn *= np.sign(np.linalg.det(turn))
+    return Mesh((mesh.vertices - mesh.centroid) @ turn.T + offset, mesh.faces)
+
+
+FAMILIES: Mapping[str, Callable[[np.random.Generator], list[Body]]] = {
+    "bundle": _bundle,
+    "ridge": _ridge,
+    "rock": _rock,
+    "shard": _shard,
+    "wedge": _wedge,
+}
