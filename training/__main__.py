@@ -1,4 +1,4 @@
-"""`python -m training generate|pack|unpack|fit|mean|centring|evaluate|compare`: labels, weights and their measures."""
+"""`python -m training generate|pack|unpack|fit|mean|centring|second-look|evaluate|compare`: labels, weights, rates."""
 
 from __future__ import annotations
 
@@ -17,13 +17,16 @@ from tesnet.cloud import PreparationConfig
 from tesnet.errors import TesnetError
 from tesnet.hands import HANDS
 from training.archive import is_archive, pack, unpack
-from training.centring import EPOCHS, learn_centring
+from training.centring import EPOCHS as CENTRING_EPOCHS
+from training.centring import learn_centring
 from training.compare import compare
 from training.evaluate import evaluate
 from training.fit import PRESETS as RECIPES
 from training.fit import fit
 from training.generate import GenerateConfig, generate
 from training.mean import mean
+from training.second_look import EPOCHS as SECOND_LOOK_EPOCHS
+from training.second_look import learn_second_look
 from training.viewing import MoreViews
 from training.views import LabelsError
 
@@ -49,6 +52,7 @@ def _parser() -> argparse.ArgumentParser:
     _add_fit(commands.add_parser("fit", help="train a network on stored labels"))
     _add_mean(commands.add_parser("mean", help="average weights that were trained one from another"))
     _add_centring(commands.add_parser("centring", help="fit the network that tells where hands stand"))
+    _add_second_look(commands.add_parser("second-look", help="fit what looks at the best candidates again"))
     _add_evaluate(commands.add_parser("evaluate", help="measure a network on stored labels"))
     _add_compare(commands.add_parser("compare", help="put trained networks side by side: table and figure"))
     return parser
@@ -295,15 +299,7 @@ def _mean(options: argparse.Namespace) -> dict[str, object]:
 
 
 def _add_centring(parser: argparse.ArgumentParser) -> None:
-    parser.add_argument("--archive", type=Path, required=True)
-    parser.add_argument("--objects", required=True, help="the sets that hold its objects, joined with commas")
-    parser.add_argument("--scenes", type=_positive, metavar="N", help="so many, drawn from the whole archive")
-    parser.add_argument("--workers", type=_positive, default=1)
-    parser.add_argument("--samples", type=Path, required=True, help="folder for what is drawn; what is there stays")
-    parser.add_argument("--epochs", type=_positive, default=EPOCHS)
-    parser.add_argument("--seed", type=int, default=0, help="of the draw and of the fit")
-    parser.add_argument("--version", default="0", help="version that the weights' header carries")
-    parser.add_argument("--out", type=Path, required=True)
+    _add_of_scenes(parser, CENTRING_EPOCHS)
     parser.set_defaults(run=_centring)
 
 
@@ -313,6 +309,33 @@ def _centring(options: argparse.Namespace) -> dict[str, object]:
         scenes=options.scenes, workers=options.workers, epochs=options.epochs, seed=options.seed,
         version=options.version,
     )  # fmt: skip
+
+
+def _add_second_look(parser: argparse.ArgumentParser) -> None:
+    parser.add_argument("--weights", type=Path, required=True, help="of the network that looks first")
+    _add_of_scenes(parser, SECOND_LOOK_EPOCHS)
+    parser.set_defaults(run=_second_look)
+
+
+def _second_look(options: argparse.Namespace) -> dict[str, object]:
+    return learn_second_look(
+        options.weights, options.archive, options.objects, options.samples, options.out,
+        scenes=options.scenes, workers=options.workers, epochs=options.epochs, seed=options.seed,
+        version=options.version,
+    )  # fmt: skip
+
+
+def _add_of_scenes(parser: argparse.ArgumentParser, epochs: int) -> None:
+    """What is asked where samples are drawn from an archive's scenes and something is fitted to them."""
+    parser.add_argument("--archive", type=Path, required=True)
+    parser.add_argument("--objects", required=True, help="the sets that hold its objects, joined with commas")
+    parser.add_argument("--scenes", type=_positive, metavar="N", help="so many, drawn from the whole archive")
+    parser.add_argument("--workers", type=_positive, default=1)
+    parser.add_argument("--samples", type=Path, required=True, help="folder for what is drawn; what is there stays")
+    parser.add_argument("--epochs", type=_positive, default=epochs)
+    parser.add_argument("--seed", type=int, default=0, help="of the draw and of the fit")
+    parser.add_argument("--version", default="0", help="version that the weights' header carries")
+    parser.add_argument("--out", type=Path, required=True)
 
 
 def _add_evaluate(parser: argparse.ArgumentParser) -> None:

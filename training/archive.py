@@ -275,7 +275,7 @@ def _render_scene(
     rng = np.random.default_rng([crc32(view.outcomes.tobytes()) for view in views])
     with World() as world:
         restore_scene(world, job.scene.description, models)
-        shown = [(view.viewing, _render_view(world, view, preparation)) for view in views]
+        shown = [(view.viewing, render_view(world, view, preparation)) for view in views]
         if views:
             others = more_views.draw(rng)
             shown += [(viewing, _from_elsewhere(world, views, viewing, preparation)) for viewing in others]
@@ -297,7 +297,7 @@ def _from_elsewhere(
         outcomes=np.concatenate([view.outcomes for view in views]),
         collision_free=np.concatenate([view.collision_free for view in views]),
     )
-    shown = _render_view(world, everything, preparation)
+    shown = render_view(world, everything, preparation)
     if shown is None:
         return None
     seen = shown.only((_shifts(shown, everything.places) < LARGEST_SHIFT).all(dim=1))
@@ -312,8 +312,11 @@ def _shifts(view: LabelledView, places: NDArray[np.float64]) -> torch.Tensor:
     return shifts
 
 
-def _render_view(world: World, view: ArchivedView, preparation: cloud.PreparationConfig) -> LabelledView | None:
-    """The view as its sensor sees it, with every label: poses stay, the nearest points stand for those of the pairs."""
+def render_view(world: World, view: ArchivedView, preparation: cloud.PreparationConfig) -> LabelledView | None:
+    """The view as its sensor sees it, with every label: poses stay, the nearest points stand for those of the pairs.
+
+    None where too little is seen.
+    """
     looked = view.viewing.look(world, 0, view.gripper, preparation)
     if looked is None:
         return None

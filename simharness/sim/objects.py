@@ -13,6 +13,7 @@ with +z up. A built-in test set and its training set share no object.
 `novel`, `flat`, `wide`     made by `simharness.sim.shapes`, of families that no training set holds
 `shapes-train`              made by `simharness.sim.shapes`, of other families
 `extremes-train`            likewise: thin things, wide ones, and those that can be held in few places
+`slopes-train`              likewise: things whose faces lean
 ==========================  ====================================================================================
 """
 

@@ -22,6 +22,7 @@ from tesnet.networks.around_hand import PROBES, PROBES_IN_FINGERS, Region, ends,
 from tesnet.networks.low_things import unevenness
 from tesnet.networks.network import mirror_factors
 from tesnet.networks.rims import poor_pinch
+from tesnet.networks.second_look import SecondLook, seen_by_fingers
 from tesnet.networks.told import TOLD_INPUTS, told_inputs
 from tesnet.patches import Patches, group, pool
 from tesnet.points import points_in_grasp_frames
@@ -61,6 +62,8 @@ class TesNetConfig:
             which may be several: these are found by heights, where a network sees one thing. Not in training.
         rims: log odds that a candidate of a hand whose tips swing far loses where it would pinch a rim that it drops
             (`poor_pinch`). Not in training.
+        second_look: so many candidates of a call, the best, are looked at again, finger by finger (`SecondLook`), which
+            is trained by itself when the rest is. Not in training.
     """
 
     channels: int = 32
@@ -81,6 +84,7 @@ class TesNetConfig:
     mirrored: int = 0
     evenness: float = 0.0
     rims: float = 0.0
+    second_look: int = 0
 
 
 @dataclass(frozen=True, eq=False, slots=True)
@@ -130,6 +134,8 @@ class TesNet(nn.Module):
         )
         if config.told:
             self.told = Told(config)
+        if config.second_look:
+            self.second_look = SecondLook()
 
     @property
     def knows_hands(self) -> bool:
@@ -184,22 +190,41 @@ class TesNet(nn.Module):
         told = self.told(cloud, candidates, at_fingers) if self.config.told else None
         seen = _Seen(candidates, at_fingers, near_hand, told)
         one = torch.ones(len(candidates), device=cloud.points.device)
-        logits = self._logits(features, cloud, seen, one if mirror is None else mirror)
-        if self.config.mirrored and mirror is None and not self.training:
-            best = logits.topk(min(self.config.mirrored, len(logits))).indices
-            reflected = self._logits(features, cloud, seen.select(best), -one[best])
+        sign = one if mirror is None else mirror
+        behind = _depth_behind_probes(cloud, candidates, sign)
+        logits = self._logits(features, cloud, seen, behind, sign)
+        if self.training:
+            return logits
+        lost = self._lost(cloud, seen, behind)
+        if self.config.mirrored and mirror is None:
+            best = (logits - lost).topk(min(self.config.mirrored, len(logits))).indices
+            some, other = seen.select(best), -one[best]
+            reflected = self._logits(features, cloud, some, _depth_behind_probes(cloud, some.candidates, other), other)
             logits = logits.index_copy(0, best, (logits[best] + reflected) / 2)
-        return logits
+        if self.config.second_look and mirror is None:
+            best = (logits - lost).topk(min(self.config.second_look, len(logits))).indices
+            closer = self.second_look(seen_by_fingers(cloud, candidates.select(best)), logits[best])
+            logits = logits.index_copy(0, best, closer)
+        return logits - lost
 
-    def _logits(self, features: CloudFeatures, cloud: PreparedCloud, seen: _Seen, sign: Tensor) -> Tensor:
-        """Logits (C,) of candidates whose surroundings are mirrored where `sign` (C,) is -1."""
+    def _logits(
+        self, features: CloudFeatures, cloud: PreparedCloud, seen: _Seen, behind: Tensor, sign: Tensor
+    ) -> Tensor:
+        """Logits (C,) of candidates whose surroundings are mirrored where `sign` (C,) is -1.
+
+        Args:
+            features: of the cloud.
+            cloud: P points.
+            seen: the candidates, and what is looked at for them.
+            behind: (C, PROBES) how far their probes lie behind what the camera saw, mirrored likewise.
+            sign: (C,) +1 or -1.
+        """
         candidates, at_fingers, near_hand = seen.candidates, seen.at_fingers, seen.near_hand
         poses = candidates.Ts_canonical_grasp
         of_closing, of_around, of_head = seen.told or (None,) * 3
         closing = self.closing(features.points, cloud, at_fingers, poses, sign, of_closing)
         around = self.around(features.wide, features.patches, near_hand, poses, sign, of_around)
         totals = torch.stack([at_fingers.total, near_hand.total], dim=1)
-        behind = _depth_behind_probes(cloud, candidates, sign)
         joined = (
             self.pooled(torch.cat([closing, around], dim=1))
             + self.approach(features.points)[candidates.approach]
@@ -211,16 +236,26 @@ class TesNet(nn.Module):
         if of_head is not None:
             joined = joined + of_head
         logits: Tensor = self.head(joined)[:, 0]
-        if self.training:
-            return logits
+        return logits
+
+    def _lost(self, cloud: PreparedCloud, seen: _Seen, behind: Tensor) -> Tensor:
+        """(C,) log odds that candidates lose for what labels do not teach, and so nothing that is learned makes good.
+
+        Args:
+            cloud: P points.
+            seen: the candidates, and what is looked at for them.
+            behind: (C, PROBES) how far their probes lie behind what the camera saw.
+        """
+        candidates, index = seen.candidates, seen.at_fingers.index
+        lost = torch.zeros_like(candidates.widths)
         if self.config.caution:
             unseen = behind[:, :PROBES_IN_FINGERS] > SHADOW_MARGIN
-            logits = logits - self.config.caution * unseen.float().mean(dim=1)
+            lost = lost + self.config.caution * unseen.float().mean(dim=1)
         if self.config.evenness:
-            logits = logits - self.config.evenness * unevenness(cloud, candidates, at_fingers.index)
+            lost = lost + self.config.evenness * unevenness(cloud, candidates, index)
         if self.config.rims:
-            logits = logits - self.config.rims * poor_pinch(cloud, candidates, at_fingers.index)
-        return logits
+            lost = lost + self.config.rims * poor_pinch(cloud, candidates, index)
+        return lost
 
 
 class EncoderStage(nn.Module):

@@ -307,7 +307,7 @@ def test_a_new_camera_shows_the_candidates_of_whose_pair_it_sees_both_points(mon
         asked.append(everything)
         return view
 
-    monkeypatch.setattr(archive, "_render_view", rendered)
+    monkeypatch.setattr(archive, "render_view", rendered)
     shown = archive._from_elsewhere(None, halves, looked, PreparationConfig())  # type: ignore[arg-type]
     assert shown is not None
     (everything,) = asked
@@ -319,5 +319,5 @@ def test_a_new_camera_shows_the_candidates_of_whose_pair_it_sees_both_points(mon
     assert torch.equal(shown.outcomes, view.outcomes[torch.from_numpy(near)])
     assert torch.equal(shown.collision_free, ~blocked(shown.cloud, shown.candidates, "free"))
     assert shown.collision_free.any()
-    monkeypatch.setattr(archive, "_render_view", lambda *_: None)
+    monkeypatch.setattr(archive, "render_view", lambda *_: None)
     assert archive._from_elsewhere(None, halves, looked, PreparationConfig()) is None  # type: ignore[arg-type]

@@ -40,7 +40,17 @@ def told(monkeypatch: pytest.MonkeyPatch) -> dict[str, Told]:
 
         return noted
 
-    for name in ("generate", "pack", "unpack", "fit", "mean", "learn_centring", "evaluate", "compare"):
+    for name in (
+        "generate",
+        "pack",
+        "unpack",
+        "fit",
+        "mean",
+        "learn_centring",
+        "learn_second_look",
+        "evaluate",
+        "compare",
+    ):
         monkeypatch.setattr(command, name, noting(getattr(command, name), calls.setdefault(name, [])))
     return calls
 
@@ -70,11 +80,12 @@ CENTRING = {
     "archive": "packed", "objects": "procedural,ycb", "scenes": 12, "workers": 3, "samples": "drawn", "epochs": 4,
     "seed": 6, "version": "1.4", "out": "o/centring.w",
 }  # fmt: skip
+SECOND_LOOK = {"weights": "w.safetensors", **CENTRING, "version": "1.5"}
 COMPARE = {"data": "runs", "out": "tables", "validation": ("one", "two")}
 PACK = {"data": ("one", "two"), "out": "archive"}
 EVERY_OPTION: dict[str, dict[str, Any]] = {
     "generate": GENERATE, "pack": PACK, "unpack": UNPACK, "fit": FIT, "mean": MEAN, "evaluate": EVALUATE,
-    "centring": CENTRING, "compare": COMPARE,
+    "centring": CENTRING, "second-look": SECOND_LOOK, "compare": COMPARE,
 }  # fmt: skip
 
 
@@ -144,6 +155,10 @@ def test_what_is_packed_rendered_averaged_measured_and_compared_is_what_the_opti
     assert main(["centring", *words(CENTRING)]) == 0
     files = {name: Path(str(CENTRING[name])) for name in ("archive", "samples", "out")}
     assert told["learn_centring"] == [CENTRING | files]
+    assert main(["second-look", *words(SECOND_LOOK)]) == 0
+    files["file"] = Path("w.safetensors")
+    asked = {name: value for name, value in SECOND_LOOK.items() if name != "weights"}
+    assert told["learn_second_look"] == [asked | files]
     (evaluated,) = told["evaluate"]
     assert evaluated == {
         "name": "gpd", "path": Path("w.safetensors"), "data": paths(["one", "two"]), "seed": 4,

@@ -17,6 +17,7 @@ from tesnet.networks import encode
 from tesnet.networks.around_hand import PROBES_IN_FINGERS, probes
 from tesnet.networks.low_things import unevenness
 from tesnet.networks.rims import poor_pinch
+from tesnet.networks.second_look import seen_by_fingers
 from tesnet.networks.tesnet import (
     CloudFeatures,
     TesNet,
@@ -290,6 +291,25 @@ def test_the_best_candidates_are_scored_in_both_mirrored_forms_but_not_in_traini
         few = found.select(best[:3])
         torch.testing.assert_close(both.score(seen, ready, few), expected[best[:3]], atol=1e-5, rtol=0)
         torch.testing.assert_close(both.train().score(seen, ready, found), plain, atol=1e-5, rtol=0)
+
+
+def test_the_best_candidates_are_looked_at_again_but_not_in_training() -> None:
+    ready, found = example()
+    torch.manual_seed(0)
+    twice = TesNet(replace(fresh_network().config, second_look=20))
+    twice.load_state_dict(fresh_network().state_dict(), strict=False)
+    torch.nn.init.normal_(twice.second_look.change.weight)
+    with torch.inference_mode():
+        expected, seen = score(found).clone(), features()
+        best = expected.argsort(descending=True)[:20]
+        expected[best] = twice.eval().second_look(
+            seen_by_fingers(ready, at_rest(ready, found.select(best))), expected[best]
+        )
+        assert (expected[best] - score(found)[best]).abs().max() > 0.1
+        torch.testing.assert_close(twice.score(seen, ready, found), expected, atol=1e-4, rtol=0)
+        one = torch.ones(len(found))
+        torch.testing.assert_close(twice.score(seen, ready, found, one), score(found), atol=1e-5, rtol=0)
+        torch.testing.assert_close(twice.train().score(seen, ready, found), score(found), atol=1e-5, rtol=0)
 
 
 def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
