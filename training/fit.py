@@ -233,7 +233,7 @@ def _first_network(name: str, recipe: Recipe, start: Path | None) -> Network:
     """The network to train: with random weights, or with those of a file and its configuration.
 
     Layers that it has got since that file was made, if a fresh one's are zero, and inputs of layers, which stand last,
-    begin at zero.
+    begin at zero. A second look is left out: it learns afterwards what the rest then leaves (`training.second_look`).
     """
     if start is None:
         return networks.build(name, recipe.network)
@@ -241,8 +241,11 @@ def _first_network(name: str, recipe: Recipe, start: Path | None) -> Network:
     other = LabelsError(f"{start} holds a {header.network} of another configuration; begin without --start")
     if header.network != name:
         raise other
+    configuration = {**header.configuration["network"], **recipe.network}
+    configuration.pop("second_look", None)
+    state = {key: tensor for key, tensor in state.items() if not key.startswith("second_look.")}
     try:
-        network = networks.build(name, {**header.configuration["network"], **recipe.network})
+        network = networks.build(name, configuration)
     except (KeyError, TypeError, ValueError) as error:
         raise other from error
     fresh = network.state_dict()

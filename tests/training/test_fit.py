@@ -443,6 +443,15 @@ def test_a_network_that_was_not_told_goes_on_as_one_that_is_and_stays_so(tmp_pat
     assert fitting._first_network("tesnet", recipe, None).config.told
 
 
+def test_a_network_that_looks_twice_goes_on_as_one_that_looks_once() -> None:
+    state, header = weights.load(weights.default_weights())
+    assert header.configuration["network"]["second_look"] > 0
+    begun = fitting._first_network("tesnet", PRESETS["product"], weights.default_weights())
+    assert begun.config.second_look == 0
+    first = {key: tensor for key, tensor in state.items() if not key.startswith("second_look.")}
+    torch.testing.assert_close(dict(begun.state_dict()), first, atol=0, rtol=0)
+
+
 def test_a_checkpoint_from_before_a_field_of_the_recipe_goes_on(folder: Path, tmp_path: Path) -> None:
     run(folder, tmp_path / "a.safetensors", epochs=1)
     path = tmp_path / "a.checkpoint"
