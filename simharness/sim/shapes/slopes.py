@@ -60,6 +60,40 @@ def _ridge(rng: np.random.Generator) -> list[Body]:
     return bodies
 
 
+def _vane(rng: np.random.Generator) -> list[Body]:
+    """A core from which three to six plates stand out, thinner towards their ends."""
+    core = _pebble(rng, rng.uniform(0.014, 0.026))
+    bodies = [solid([core], any_colour(rng))]
+    for _ in range(int(rng.integers(3, 7))):
+        reach, wide, thick = rng.uniform(0.04, 0.075), rng.uniform(0.012, 0.03), rng.uniform(0.005, 0.011)
+        root = np.array([(-wide, -thick), (wide, -thick), (wide, thick), (-wide, thick)])
+        end = root * (rng.uniform(0.3, 1.1), rng.uniform(0.2, 0.7))
+        blade = loft([at_height(root, 0.0), at_height(end, reach)])
+        turn = _rotation(rng)
+        bodies.append(solid([Mesh(blade.vertices @ turn.T + core.centroid, blade.faces)], any_colour(rng)))
+    return bodies
+
+
+def _knuckle(rng: np.random.Generator) -> list[Body]:
+    """Three to five rocks in a bent row."""
+    place, heading, bodies = np.zeros(3), _direction(rng), []
+    for _ in range(int(rng.integers(3, 6))):
+        size = rng.uniform(0.014, 0.03)
+        bodies.append(solid([_tumbled(rng, _pebble(rng, size), place)], any_colour(rng)))
+        heading = heading + 0.6 * _direction(rng)
+        heading /= np.linalg.norm(heading)
+        place = place + heading * size * rng.uniform(0.6, 0.9)
+    return bodies
+
+
+def _elbow(rng: np.random.Generator) -> list[Body]:
+    """Two narrowing bars that meet at an angle."""
+    size = rng.uniform(0.016, 0.036)
+    parts = [_bar(rng, rng.uniform(0.05, 0.1), size * rng.uniform(0.8, 1.2)) for _ in range(2)]
+    turn = rng.uniform(0.7, 2.5)
+    return [solid([part], any_colour(rng)) for part in (parts[0], turned(parts[1], turn))]
+
+
 def _bar(rng: np.random.Generator, length: float, size: float) -> Mesh:
     section = _outline(rng, 3, 4) * size
     far = section * rng.uniform(0.25, 1.0) + rng.uniform(-0.4, 0.4, 2) * size
@@ -95,15 +129,22 @@ def _direction(rng: np.random.Generator) -> Array:
 
 def _tumbled(rng: np.random.Generator, mesh: Mesh, offset: Array) -> Mesh:
     """A mesh turned anyhow about its centroid, which then lies at the offset."""
+    return Mesh((mesh.vertices - mesh.centroid) @ _rotation(rng).T + offset, mesh.faces)
+
+
+def _rotation(rng: np.random.Generator) -> Array:
+    """Any rotation (3, 3)."""
     turn, _ = np.linalg.qr(rng.standard_normal((3, 3)))
-    turn *= np.sign(np.linalg.det(turn))
-    return Mesh((mesh.vertices - mesh.centroid) @ turn.T + offset, mesh.faces)
+    return np.asarray(turn * np.sign(np.linalg.det(turn)))
 
 
 FAMILIES: Mapping[str, Callable[[np.random.Generator], list[Body]]] = {
     "bundle": _bundle,
+    "elbow": _elbow,
+    "knuckle": _knuckle,
     "ridge": _ridge,
     "rock": _rock,
     "shard": _shard,
+    "vane": _vane,
     "wedge": _wedge,
 }
