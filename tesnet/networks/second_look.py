@@ -20,6 +20,8 @@ ROWS, COLUMNS = 9, 11
 candidate's contact point lies; and along its length, the first ahead of its end."""
 
 AHEAD = 0.0125
+"""So far ahead of the fingertips a pad's picture begins."""
+
 _BESIDE = 0.6
 """Points farther from the middle than this share of the opening are not looked at."""
 

@@ -62,8 +62,8 @@ class TesNetConfig:
             which may be several: these are found by heights, where a network sees one thing. Not in training.
         rims: log odds that a candidate of a hand whose tips swing far loses where it would pinch a rim that it drops
             (`poor_pinch`). Not in training.
-        second_look: so many candidates of a call, the best, are looked at again, finger by finger (`SecondLook`), which
-            is trained by itself when the rest is. Not in training.
+        second_look: so many candidates of a call, the best, are looked at again, finger by finger (`SecondLook`), by
+            what learns after the rest has. Not in training.
     """
 
     channels: int = 32
