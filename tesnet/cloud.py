@@ -127,6 +127,7 @@ class PreparedCloud:
         dropped_far, dropped_surplus: points ignored because of `max_extent` and of `max_points`.
         support_error: how far the support plane may be from where it is taken to be, metres; a height that was given is
             taken to be right.
+        pose_in_doubt: whether the camera may not stand where it is said to, as who asks for `calibrate` fears.
     """
 
     points: Tensor
@@ -144,6 +145,7 @@ class PreparedCloud:
     dropped_far: int = 0
     dropped_surplus: int = 0
     support_error: float = 0.0
+    pose_in_doubt: bool = False
 
     def __len__(self) -> int:
         return len(self.points)
@@ -242,6 +244,7 @@ def prepare(
             a_cell,
             between,
         ),
+        pose_in_doubt=query.calibrate,
         dropped_far=dropped_far,
         dropped_surplus=int((~kept).sum()),
         support_error=0.0 if support is None else support.noise_sd,

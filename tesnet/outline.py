@@ -86,8 +86,8 @@ def outline(cloud: PreparedCloud, query: GraspQuery) -> Outline:
     What lies beyond is looked up in all posted points, not in the prepared ones, so a face that the workspace or the
     cell limit cuts does not end there. Where no point was posted beyond, the image may have ended: such an edge counts
     only where a support plane is known whose own points the caller has removed, and not at a side of the workspace.
-    What such a caller's image cut off cannot be told from an edge. Who asks for `calibrate` doubts where the camera
-    stands: there faces have an outline only where they are seen from straight above.
+    What such a caller's image cut off cannot be told from an edge. Where the camera's pose is in doubt, faces have an
+    outline only where they are seen from straight above.
     """
     travel = -(cloud.view_directions if cloud.up is None else cloud.up.expand_as(cloud.points))
     ends = _Ends.of(cloud, travel)
@@ -96,7 +96,7 @@ def outline(cloud: PreparedCloud, query: GraspQuery) -> Outline:
     walls = (cloud.normals[cloud.neighbours[found]] * outward[:, None]).sum(dim=2) > _WALL
     sight = cloud.view_directions[found]
     lean, drop = (sight * outward).sum(dim=1), (sight * -travel[found]).sum(dim=1)
-    seen_past = (lean.abs() <= MOST_LEAN * drop) & (drop >= (_STEEPEST if query.calibrate else 0.0))
+    seen_past = (lean.abs() <= MOST_LEAN * drop) & (drop >= (_STEEPEST if cloud.pose_in_doubt else 0.0))
     ends_in_air = ~walls.any(dim=1) & (seen_past | is_low(cloud)[found])
     found, outward = found[ends_in_air], outward[ends_in_air]
     if len(found):

@@ -45,8 +45,8 @@ def search(
 ) -> Found:
     """At most `max_candidates` candidates of a cloud, and which are free of collision.
 
-    Who asks for `calibrate` doubts where the camera stands. There hands go by the rules whatever was learned: where it
-    puts them, they fit into less room than a camera may be off.
+    Where the camera's pose is in doubt, hands go by the rules whatever was learned: where it puts them, they fit into
+    less room than a camera may be off.
 
     Args:
         cloud: where.
@@ -56,7 +56,7 @@ def search(
         between: called between blocks of work of some tens of milliseconds.
     """
     between()
-    config = replace(config, centring=None) if query.calibrate else config
+    config = replace(config, centring=None) if cloud.pose_in_doubt else config
     found, rejected = generate(cloud, query, config, edges, between)
     between()
     lost = palm_blocked(cloud.points, found, *reach_of_fitting(cloud, found, config), between)

@@ -26,7 +26,7 @@ from simharness.sim.scene import restore_scene
 from simharness.sim.world import World
 from tesnet import networks, weights
 from tesnet.candidates import at_rest
-from tesnet.networks.second_look import INPUTS, SecondLook, seen_by_fingers
+from tesnet.networks.second_look import INPUTS, SecondLook, looks_again, seen_by_fingers
 from tesnet.networks.tesnet import TesNet
 from tesnet.predictor import configuration_of
 from tesnet.whole_file import write_whole
@@ -121,7 +121,7 @@ def _views_of(scene: ArchivedScene, models: Mapping[str, ObjectModel], network: 
     with World() as world:
         restore_scene(world, scene.description, models)
         for number, archived in enumerate(scene.views):
-            view = render_view(world, archived, network.preparation)
+            view = render_view(world, archived, network.preparation) if looks_again(archived.gripper) else None
             if view is None or not view.collision_free.any():
                 continue
             view = view.only(view.collision_free)

@@ -12,6 +12,8 @@ from torch import Tensor, nn
 
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
+from tesnet.geometry import Gripper
+from tesnet.networks.rims import FAR_SWING
 from tesnet.points import points_in_grasp_frames
 
 CELL = 0.0055
@@ -40,6 +42,15 @@ INPUTS = _PICTURES + _ABOUT
 
 _AT_ONCE = 500_000
 """Places of points in grasp frames that are in memory at a time."""
+
+
+def looks_again(hand: Gripper) -> bool:
+    """Whether a hand is one that the second look tells more of.
+
+    Hands whose tips swing far pinch otherwise, and among its samples there were too few: where it looks again at these,
+    twice as much slips out of them (training/NOTES.md).
+    """
+    return hand.travel < FAR_SWING
 
 
 class SecondLook(nn.Module):

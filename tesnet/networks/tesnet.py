@@ -22,7 +22,7 @@ from tesnet.networks.around_hand import PROBES, PROBES_IN_FINGERS, Region, ends,
 from tesnet.networks.low_things import unevenness
 from tesnet.networks.network import mirror_factors
 from tesnet.networks.rims import poor_pinch
-from tesnet.networks.second_look import SecondLook, seen_by_fingers
+from tesnet.networks.second_look import SecondLook, looks_again, seen_by_fingers
 from tesnet.networks.told import TOLD_INPUTS, told_inputs
 from tesnet.patches import Patches, group, pool
 from tesnet.points import points_in_grasp_frames
@@ -63,7 +63,8 @@ class TesNetConfig:
         rims: log odds that a candidate of a hand whose tips swing far loses where it would pinch a rim that it drops
             (`poor_pinch`). Not in training.
         second_look: so many candidates of a call, the best, are looked at again, finger by finger (`SecondLook`), by
-            what learns after the rest has. Not in training.
+            what learns after the rest has: not for hands whose tips swing far, nor where the camera's pose is in doubt.
+            Not in training.
     """
 
     channels: int = 32
@@ -201,7 +202,8 @@ class TesNet(nn.Module):
             some, other = seen.select(best), -one[best]
             reflected = self._logits(features, cloud, some, _depth_behind_probes(cloud, some.candidates, other), other)
             logits = logits.index_copy(0, best, (logits[best] + reflected) / 2)
-        if self.config.second_look and mirror is None:
+        again = looks_again(candidates.gripper) and not cloud.pose_in_doubt  # or the hand stands where nobody looked
+        if self.config.second_look and mirror is None and again:
             best = (logits - lost).topk(min(self.config.second_look, len(logits))).indices
             closer = self.second_look(seen_by_fingers(cloud, candidates.select(best)), logits[best])
             logits = logits.index_copy(0, best, closer)

@@ -50,9 +50,8 @@ def test_nothing_is_found_where_nothing_is_a_candidate() -> None:
 
 def test_hands_go_by_rules_where_the_camera_s_pose_is_in_doubt() -> None:
     query = tabletop_query(max_candidates=200)
-    cloud = prepared(query)
     learned, doubted, by_rules = (
-        search(cloud, asked, config).candidates.Ts_canonical_grasp
+        search(prepared(asked), asked, config).candidates.Ts_canonical_grasp
         for asked, config in (
             (query, CandidateConfig()),
             (query.but(calibrate=True), CandidateConfig()),

@@ -309,7 +309,23 @@ def test_the_best_candidates_are_looked_at_again_but_not_in_training() -> None:
         torch.testing.assert_close(twice.score(seen, ready, found), expected, atol=1e-4, rtol=0)
         one = torch.ones(len(found))
         torch.testing.assert_close(twice.score(seen, ready, found, one), score(found), atol=1e-5, rtol=0)
+        doubted = replace(ready, pose_in_doubt=True)
+        torch.testing.assert_close(twice.score(seen, doubted, found), score(found), atol=1e-5, rtol=0)
         torch.testing.assert_close(twice.train().score(seen, ready, found), score(found), atol=1e-5, rtol=0)
+
+
+@pytest.mark.parametrize(("name", "again"), [("robotiq_2f140", True), ("hand_e", True), ("rg2", False), ("rg6", False)])
+def test_hands_whose_tips_swing_far_are_looked_at_once(name: str, again: bool) -> None:
+    query = tabletop_query(max_candidates=60, gripper=HANDS[name].gripper)
+    ready = prepared(query)
+    found = candidates.generate(ready, query, candidates.CandidateConfig())[0]
+    torch.manual_seed(0)
+    twice = TesNet(replace(fresh_network().config, second_look=20)).eval()
+    twice.load_state_dict(fresh_network().state_dict(), strict=False)
+    torch.nn.init.normal_(twice.second_look.change.weight)
+    with torch.inference_mode():
+        once, now = (net.score(net.encode_batch([ready])[0], ready, found) for net in (fresh_network(), twice))
+    assert ((once - now).abs().max() > 0.1) == again
 
 
 def test_sides_of_the_workspace_count_where_the_hand_comes_near_them() -> None:
