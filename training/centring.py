@@ -6,9 +6,8 @@ from its cameras and from others, gives candidates by the hundred whose hand pas
 
 from __future__ import annotations
 
-from collections.abc import Iterator, Mapping, Sequence
+from collections.abc import Iterator, Mapping
 from functools import partial
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -18,7 +17,6 @@ import torch
 from numpy.typing import NDArray
 from torch import Tensor
 from torch.nn.functional import binary_cross_entropy_with_logits, l1_loss
-from tqdm import tqdm
 
 from simharness.sim.objects import ObjectModel
 from simharness.sim.scene import restore_scene
@@ -26,11 +24,10 @@ from simharness.sim.world import World
 from tesnet import centring, weights
 from tesnet.candidates import CandidateConfig, Candidates, at_rest, contact_places, generate
 from tesnet.cloud import PreparationConfig, PreparedCloud
-from tesnet.whole_file import write_whole
 from training.archive import SceneFile, for_each_scene
 from training.parts import ArchivedScene
+from training.samples import descend, read_samples, write_samples
 from training.viewing import MoreViews
-from training.views import LabelsError
 
 Floats = NDArray[np.float32]
 
@@ -49,12 +46,8 @@ EPOCHS = 16
 CLEARANCE = 0.5
 """A hand passes where this is left beside each finger, in the places' unit."""
 
-_BATCH = 512
 _WITHHELD = 0.15
 """Of the samples so many are shown without what `up` tells."""
-
-_HELD_OUT = 20
-"""One scene of so many is not trained on."""
 
 
 def learn_centring(
@@ -101,9 +94,7 @@ def _sample_scene(job: SceneFile, models: Mapping[str, ObjectModel], *, seed: in
     found = list(_of_scene(job.scene, models, seed))
     seen = np.concatenate([np.zeros((0, centring.SEEN), np.float32), *(part for part, _ in found)])
     walls = np.concatenate([np.zeros((0, 2), np.float32), *(part for _, part in found)])
-    packed = BytesIO()
-    np.savez(packed, seen=seen.astype(np.float16), walls=walls)
-    write_whole(job.path, packed.getvalue())
+    write_samples(job.path, seen=seen.astype(np.float16), walls=walls)
 
 
 def _of_scene(scene: ArchivedScene, models: Mapping[str, ObjectModel], seed: int) -> Iterator[tuple[Floats, Floats]]:
@@ -173,48 +164,28 @@ def fit(samples: Path, out: Path, *, epochs: int = EPOCHS, seed: int = 0, versio
     Raises:
         LabelsError: the folder holds no samples.
     """
-    files = sorted(samples.glob("walls_*.npz"))
-    if not files:
-        raise LabelsError(f"{samples} holds no walls_*.npz; draw some from an archive")
-    seen, walls, held_out = _read(files)
+    known = read_samples(samples, "walls")
+    seen, walls = known.columns["seen"], known.columns["walls"]
     torch.manual_seed(seed)
     network = centring.Centring()
-    train, test = (~held_out).nonzero()[:, 0], held_out.nonzero()[:, 0]
+    train, test = known.train, known.held_out
     network.mean = seen[train].float().mean(dim=0)
     network.spread = seen[train].float().std(dim=0) + 0.05
+
+    def loss_of(rows: Tensor) -> Tensor:
+        shown = seen[rows].float()
+        withheld = torch.rand(len(shown)) < _WITHHELD
+        shown[withheld, -centring.BY_HAND + 1 : -centring.BY_HAND + 4] = 0.0
+        return _loss(network, shown, walls[rows])
+
     optimiser = torch.optim.AdamW(network.parameters(), lr=1e-3, weight_decay=1e-3)
-    steps = -(-len(train) // _BATCH)
-    schedule = torch.optim.lr_scheduler.CosineAnnealingLR(optimiser, epochs * steps)
-    for epoch in range(epochs):
-        total = 0.0
-        for rows in tqdm(train[torch.randperm(len(train))].split(_BATCH), desc=f"epoch {epoch}"):
-            shown = seen[rows].float()
-            withheld = torch.rand(len(shown)) < _WITHHELD
-            shown[withheld, -centring.BY_HAND + 1 : -centring.BY_HAND + 4] = 0.0
-            loss = _loss(network, shown, walls[rows])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            total += float(loss.detach())
-        tqdm.write(f"epoch {epoch}: {total / steps:.4f}")
+    descend(train, loss_of, optimiser, partial(torch.optim.lr_scheduler.CosineAnnealingLR, optimiser), epochs)
     network.eval()
     measures = _measures(network, seen[test].float(), walls[test])
     card = {"samples": len(train), "seed": seed, "epochs": epochs, "held_out": measures}
     header = weights.Header(centring.NAME, version, {"hidden": network.hidden}, training=card)
     weights.save(out, network.state_dict(), header)
     return card
-
-
-def _read(files: Sequence[Path]) -> tuple[Tensor, Tensor, Tensor]:
-    """What was seen (S, SEEN), where the walls are (S, 2), and which samples are held out (S,)."""
-    seen, walls, held_out = [], [], []
-    for file in files:
-        with np.load(file, allow_pickle=False) as stored:
-            seen.append(torch.from_numpy(stored["seen"]))
-            walls.append(torch.from_numpy(stored["walls"]))
-        held_out.append(torch.full((len(seen[-1]),), int(file.stem.split("_")[1]) % _HELD_OUT == 0))
-    return torch.cat(seen), torch.cat(walls), torch.cat(held_out)
 
 
 def _fits(walls: Tensor) -> Tensor:

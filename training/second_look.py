@@ -7,9 +7,8 @@ network was not trained on, or its logits are better than they will be where it 
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import dataclass, replace
+from dataclasses import replace
 from functools import cache, partial
-from io import BytesIO
 from pathlib import Path
 from typing import Any
 from zlib import crc32
@@ -18,7 +17,6 @@ import numpy as np
 import torch
 from torch import Tensor, nn
 from torch.nn.functional import binary_cross_entropy_with_logits
-from tqdm import tqdm
 
 from simharness.sim.objects import ObjectModel
 from simharness.sim.outcome_kinds import OUTCOME_KINDS
@@ -29,10 +27,10 @@ from tesnet.candidates import at_rest
 from tesnet.networks.second_look import INPUTS, SecondLook, looks_again, seen_by_fingers
 from tesnet.networks.tesnet import TesNet
 from tesnet.predictor import configuration_of
-from tesnet.whole_file import write_whole
 from training import metrics
 from training.archive import SceneFile, for_each_scene, render_view
 from training.parts import ArchivedScene
+from training.samples import Samples, descend, read_samples, write_samples
 from training.views import LabelledView, LabelsError
 
 BEST = 64
@@ -42,12 +40,15 @@ _BEST, _OTHERS = 60, 60
 """Samples of each view: its best candidates, and others."""
 
 EPOCHS = 8
-_BATCH, _RATE, _DECAY = 512, 1.5e-3, 0.02
+_RATE, _DECAY = 1.5e-3, 0.02
 _HELD = 0.5
 """Weight of the loss of what the trunk tells besides: whether a grasp that is reached holds."""
 
-_HELD_OUT = 20
-"""One scene of so many is not trained on."""
+_AT_ONCE = 2048
+"""Samples that are measured at a time."""
+
+_MOST_VIEWS = 1000
+"""More than any scene has."""
 
 
 def learn_second_look(
@@ -94,25 +95,28 @@ def sample(
     return {"scenes": for_each_scene(archive, objects, make, out, "looks", workers, scenes=scenes, seed=seed)}
 
 
+def _loaded(file: Path) -> tuple[TesNet, weights.Header]:
+    network, header = networks.load(file)
+    if not isinstance(network, TesNet):
+        raise LabelsError(f"{file} holds no tesnet; only that network looks twice")
+    return network, header
+
+
 @cache
 def _first_look(file: Path) -> TesNet:
     """The network in a weights file without a second look, and without what labels do not teach.
 
     Or the second look would learn that candidates lose log odds of which the labels say nothing.
     """
-    network, _ = networks.load(file)
-    if not isinstance(network, TesNet):
-        raise LabelsError(f"{file} holds no tesnet; only that network looks twice")
+    network, _ = _loaded(file)
     network.config = replace(network.config, second_look=0, caution=0.0, evenness=0.0, rims=0.0)
     return network.eval().requires_grad_(requires_grad=False)
 
 
 def _sample_scene(job: SceneFile, models: Mapping[str, ObjectModel], *, file: Path) -> None:
     views = list(_views_of(job.scene, models, _first_look(file)))
-    packed = BytesIO()
     columns = [np.concatenate(column) for column in zip(*views, strict=True)] if views else [np.zeros((0, INPUTS))] * 4
-    np.savez(packed, seen=columns[0], logits=columns[1], outcomes=columns[2], views=columns[3])
-    write_whole(job.path, packed.getvalue())
+    write_samples(job.path, seen=columns[0], logits=columns[1], outcomes=columns[2], views=columns[3])
 
 
 def _views_of(scene: ArchivedScene, models: Mapping[str, ObjectModel], network: TesNet) -> list[Sequence[Any]]:
@@ -142,17 +146,6 @@ def _logits(network: TesNet, view: LabelledView) -> Tensor:
     return torch.cat([network.score(features, view.cloud, view.candidates.select(some)) for some in rows])
 
 
-@dataclass(frozen=True, eq=False, slots=True)
-class _Samples:
-    """S samples: what fingers see (S, INPUTS), logits, outcomes, numbers of views, and which are held out (S,)."""
-
-    seen: Tensor
-    logits: Tensor
-    outcomes: Tensor
-    views: Tensor
-    held_out: Tensor
-
-
 def fit(
     file: Path, samples: Path, out: Path, *, epochs: int = EPOCHS, seed: int = 0, version: str = "0"
 ) -> dict[str, Any]:
@@ -173,17 +166,16 @@ def fit(
         LabelsError: the folder holds no samples.
         WeightsError: the weights cannot be used.
     """
-    known = _read(samples)
-    first, (_, header) = _first_look(file), networks.load(file)
+    known = read_samples(samples, "looks")
+    first, header = _loaded(file)
     torch.manual_seed(seed)
     look = SecondLook()
     _train(look, known, header.calibration, epochs)
-    held_out = known.held_out.nonzero()[:, 0]
-    measures = _measures(look.eval(), known, held_out, header.calibration)
+    measures = _measures(look.eval(), known, header.calibration)
     network = networks.build(header.network, {**header.configuration["network"], "second_look": BEST})
     of_look = {f"second_look.{name}": tensor for name, tensor in look.state_dict().items()}
     network.load_state_dict({**first.state_dict(), **of_look})
-    card = {"samples": len(known.seen) - len(held_out), "seed": seed, "epochs": epochs, "held_out": measures}
+    card = {"samples": len(known.train), "seed": seed, "epochs": epochs, "held_out": measures}
     training = {"first_look": {"sha256": weights.sha256(file), "training": dict(header.training)}, "second_look": card}
     configuration = {**configuration_of(network), "candidates": header.configuration["candidates"]}
     kept = weights.Header(header.network, version, configuration, header.calibration, training)
@@ -191,52 +183,33 @@ def fit(
     return card
 
 
-def _read(folder: Path) -> _Samples:
-    files = sorted(folder.glob("looks_*.npz"))
-    if not files:
-        raise LabelsError(f"{folder} holds no looks_*.npz; draw some from an archive")
-    columns: list[list[Tensor]] = [[], [], [], [], []]
-    for file in files:
-        number = int(file.stem.split("_")[1])
-        with np.load(file, allow_pickle=False) as stored:
-            told = [torch.from_numpy(stored[name]) for name in ("seen", "logits", "outcomes", "views")]
-        if len(told[0]):
-            told[3] = told[3] + 1000 * number  # unlike those of all other scenes
-            for column, value in zip(columns, [*told, torch.full_like(told[3], number % _HELD_OUT == 0)], strict=True):
-                column.append(value)
-    seen, logits, outcomes, views, held_out = (torch.cat(column) for column in columns)
-    return _Samples(seen, logits, outcomes, views, held_out.bool())
-
-
-def _train(look: SecondLook, known: _Samples, calibration: tuple[float, float], epochs: int) -> None:
-    rows = (~known.held_out).nonzero()[:, 0]
+def _train(look: SecondLook, known: Samples, calibration: tuple[float, float], epochs: int) -> None:
+    everything, before, outcomes = (known.columns[name] for name in ("seen", "logits", "outcomes"))
+    rows = known.train
     some = rows[torch.randperm(len(rows))[:40_000]]
-    told = torch.cat([known.seen[some].float(), known.logits[some, None]], dim=1)
+    told = torch.cat([everything[some].float(), before[some, None]], dim=1)
     look.mean, look.spread = told.mean(dim=0), told.std(dim=0) + 0.05
     holds = nn.Linear(look.change.in_features, 1)
-    parameters = [*look.parameters(), *holds.parameters()]
-    optimiser = torch.optim.AdamW(parameters, lr=_RATE, weight_decay=_DECAY)
-    steps = -(-len(rows) // _BATCH)
-    schedule = torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=epochs * steps)
     a, b = calibration
+
+    def loss_of(batch: Tensor) -> Tensor:
+        way = int(torch.randint(len(look.order), ()))
+        seen, logits = everything[batch].float()[:, look.order[way]] * look.signs[way], before[batch]
+        success, reached = _outcomes(outcomes[batch])
+        features = look.features(seen, logits)
+        loss = binary_cross_entropy_with_logits(a * (logits + look.change(features)[:, 0]) + b, success)
+        if reached.any():
+            told_held = holds(features)[:, 0][reached]
+            loss = loss + _HELD * binary_cross_entropy_with_logits(told_held, success[reached])
+        return loss
+
     look.train()
-    for epoch in range(epochs):
-        total = 0.0
-        for batch in tqdm(rows[torch.randperm(len(rows))].split(_BATCH), desc=f"epoch {epoch}"):
-            way = int(torch.randint(len(look.order), ()))
-            seen, logits = known.seen[batch].float()[:, look.order[way]] * look.signs[way], known.logits[batch]
-            success, reached = _outcomes(known.outcomes[batch])
-            features = look.features(seen, logits)
-            loss = binary_cross_entropy_with_logits(a * (logits + look.change(features)[:, 0]) + b, success)
-            if reached.any():
-                told_held = holds(features)[:, 0][reached]
-                loss = loss + _HELD * binary_cross_entropy_with_logits(told_held, success[reached])
-            optimiser.zero_grad()
-            loss.backward()
-            optimiser.step()
-            schedule.step()
-            total += float(loss.detach())
-        tqdm.write(f"epoch {epoch}: {total / steps:.4f}")
+    optimiser = torch.optim.AdamW([*look.parameters(), *holds.parameters()], lr=_RATE, weight_decay=_DECAY)
+    descend(rows, loss_of, optimiser, partial(_one_cycle, optimiser), epochs)
+
+
+def _one_cycle(optimiser: torch.optim.Optimizer, steps: int) -> torch.optim.lr_scheduler.LRScheduler:
+    return torch.optim.lr_scheduler.OneCycleLR(optimiser, _RATE, total_steps=steps)
 
 
 def _outcomes(codes: Tensor) -> tuple[Tensor, Tensor]:
@@ -245,16 +218,20 @@ def _outcomes(codes: Tensor) -> tuple[Tensor, Tensor]:
     return (codes == OUTCOME_KINDS.index("success")).float(), ~on_the_way[codes.long()]
 
 
-def _measures(look: SecondLook, known: _Samples, rows: Tensor, calibration: tuple[float, float]) -> dict[str, Any]:
+def _measures(look: SecondLook, known: Samples, calibration: tuple[float, float]) -> dict[str, Any]:
     """Of the samples held out, before and after the second look: the served score's measures, and the best of views."""
+    rows = known.held_out
+    seen, before, outcomes, views = (known.columns[name][rows] for name in ("seen", "logits", "outcomes", "views"))
+    views = views + _MOST_VIEWS * known.scenes[rows]  # unlike those of all other scenes
     with torch.inference_mode():
-        after = torch.cat([look(known.seen[some].float(), known.logits[some]) for some in rows.split(2048)])
-    success = _outcomes(known.outcomes[rows])[0].bool().numpy()
+        parts = zip(seen.split(_AT_ONCE), before.split(_AT_ONCE), strict=True)
+        after = torch.cat([look(some.float(), logits) for some, logits in parts])
+    success = _outcomes(outcomes)[0].bool().numpy()
     told = {}
-    for name, logits in (("before", known.logits[rows]), ("after", after)):
+    for name, logits in (("before", before), ("after", after)):
         measures = metrics.served(logits.double().numpy(), success, calibration)
         told[name] = {key: measures[key] for key in ("served_loss", "calibration_error", "auroc")}
-        told[name]["best_of_view"] = _best_of_views(logits, known.views[rows], torch.from_numpy(success))
+        told[name]["best_of_view"] = _best_of_views(logits, views, torch.from_numpy(success))
     return {"candidates": len(rows), **told}
 
 

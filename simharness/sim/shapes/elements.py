@@ -105,6 +105,12 @@ def turned(mesh: Mesh, angle: float, offset: Sequence[float] = (0.0, 0.0, 0.0)) 
     return Mesh(mesh.vertices @ turn.T + np.asarray(offset), mesh.faces)
 
 
+def any_direction(rng: np.random.Generator) -> Array:
+    """A unit vector (3,), all directions alike."""
+    vector = rng.standard_normal(3)
+    return np.asarray(vector / np.linalg.norm(vector))
+
+
 def _across(direction: Array) -> tuple[Array, Array]:
     """Two unit vectors that make a right-handed frame with a direction."""
     along = direction / np.linalg.norm(direction)

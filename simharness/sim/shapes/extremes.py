@@ -11,7 +11,7 @@ from itertools import pairwise
 
 import numpy as np
 
-from simharness.sim.shapes.elements import ball, blob, rod, star, turned
+from simharness.sim.shapes.elements import any_direction, ball, blob, rod, star, turned
 from simharness.sim.solids import Array, Body, any_colour, any_grey, at_height, block, loft, solid
 from tesnet.geometry import PANDA
 
@@ -96,8 +96,7 @@ def _jack(rng: np.random.Generator) -> list[Body]:
     core = rng.uniform(0.008, 0.02)
     arms = []
     for _ in range(int(rng.integers(3, 8))):
-        direction = rng.standard_normal(3)
-        direction /= np.linalg.norm(direction)
+        direction = any_direction(rng)
         thick = rng.uniform(0.004, 0.014)
         arms.append(
             rod((0, 0, 0), (direction * rng.uniform(0.025, 0.065)).tolist(), (thick, thick * rng.uniform(0.3, 1.2)), 8)

@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from simharness.sim.shapes.elements import turned
+from simharness.sim.shapes.elements import any_direction, turned
 from simharness.sim.solids import Array, Body, Mesh, any_colour, at_height, loft, solid
 
 VERSION = 1
@@ -40,7 +40,7 @@ def _bundle(rng: np.random.Generator) -> list[Body]:
             part = _bar(rng, size * rng.uniform(2.0, 4.0), size * 0.8)
         else:
             part = _pyramid(rng, size, size * rng.uniform(1.2, 2.4)) if kind == 1 else _pebble(rng, size)
-        offset = _direction(rng) * size * rng.uniform(0.5, 0.9) if number else np.zeros(3)
+        offset = any_direction(rng) * size * rng.uniform(0.5, 0.9) if number else np.zeros(3)
         bodies.append(solid([_tumbled(rng, part, offset)], any_colour(rng)))
     return bodies
 
@@ -76,11 +76,11 @@ def _vane(rng: np.random.Generator) -> list[Body]:
 
 def _knuckle(rng: np.random.Generator) -> list[Body]:
     """Three to five rocks in a bent row."""
-    place, heading, bodies = np.zeros(3), _direction(rng), []
+    place, heading, bodies = np.zeros(3), any_direction(rng), []
     for _ in range(int(rng.integers(3, 6))):
         size = rng.uniform(0.014, 0.03)
         bodies.append(solid([_tumbled(rng, _pebble(rng, size), place)], any_colour(rng)))
-        heading = heading + 0.6 * _direction(rng)
+        heading = heading + 0.6 * any_direction(rng)
         heading /= np.linalg.norm(heading)
         place = place + heading * size * rng.uniform(0.6, 0.9)
     return bodies
@@ -120,11 +120,6 @@ def _outline(rng: np.random.Generator, fewest: int, most: int) -> Array:
     angles = 2 * np.pi * (np.arange(corners) + rng.uniform(-0.2, 0.2, corners)) / corners
     turn = rng.uniform(0, 2 * np.pi)
     return np.column_stack([np.cos(angles + turn), np.sin(angles + turn) * rng.uniform(0.5, 1.0)])
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    vector = rng.standard_normal(3)
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _tumbled(rng: np.random.Generator, mesh: Mesh, offset: Array) -> Mesh:

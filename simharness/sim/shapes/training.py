@@ -9,7 +9,7 @@ from collections.abc import Callable, Mapping
 
 import numpy as np
 
-from simharness.sim.shapes.elements import blob, rod, tube, turned
+from simharness.sim.shapes.elements import any_direction, blob, rod, tube, turned
 from simharness.sim.solids import (
     Array,
     Body,
@@ -48,7 +48,8 @@ def _sum(rng: np.random.Generator) -> list[Body]:
     size = rng.uniform(0.014, 0.026)
     stretch = rng.uniform(0.7, 1.5, 3)
     bumps = [
-        (_direction(rng), rng.uniform(0.4, 1.1) * size, rng.uniform(3.0, 9.0)) for _ in range(int(rng.integers(2, 5)))
+        (any_direction(rng), rng.uniform(0.4, 1.1) * size, rng.uniform(3.0, 9.0))
+        for _ in range(int(rng.integers(2, 5)))
     ]
     field = _random_radius(rng, size, rng.uniform(0.0, 0.2))
 
@@ -144,11 +145,6 @@ def _assembly(rng: np.random.Generator) -> list[Body]:
             )
         bodies.append(solid([part], any_colour(rng)))
     return bodies
-
-
-def _direction(rng: np.random.Generator) -> Array:
-    vector = rng.standard_normal(3)
-    return np.asarray(vector / np.linalg.norm(vector))
 
 
 def _random_radius(rng: np.random.Generator, size: float, rough: float) -> Callable[[Array], Array]:
