@@ -6,10 +6,11 @@ Few of their faces are parallel. Most are wider than the hand and have an edge o
 from __future__ import annotations
 
 from collections.abc import Callable, Mapping
+from itertools import pairwise
 
 import numpy as np
 
-from simharness.sim.shapes.elements import any_direction, turned
+from simharness.sim.shapes.elements import any_direction, rod, turned
 from simharness.sim.solids import Array, Body, Mesh, any_colour, at_height, loft, solid
 
 VERSION = 1
@@ -94,6 +95,60 @@ def _elbow(rng: np.random.Generator) -> list[Body]:
     return [solid([part], any_colour(rng)) for part in (parts[0], turned(parts[1], turn))]
 
 
+def _twist(rng: np.random.Generator) -> list[Body]:
+    """A prism of three to five faces whose section turns, shrinks and drifts along its length."""
+    section, length = _outline(rng, 3, 5) * rng.uniform(0.018, 0.05), rng.uniform(0.05, 0.12)
+    turn, shrink, drift = -rng.uniform(0.4, 2.4), rng.uniform(0.3, 1.1), rng.uniform(-0.02, 0.02, 2)
+    rings, mirrored = [], rng.choice([-1.0, 1.0])
+    for share in np.linspace(0.0, 1.0, 9):
+        c, s = np.cos(turn * share), np.sin(turn * share)
+        ring = section @ np.array([[c, s], [-s, c]]) * (1.0 + (shrink - 1.0) * share) + drift * share
+        rings.append(at_height(ring * (1.0, mirrored), length * share))
+    return [solid([loft(pair) for pair in pairwise(rings)], any_colour(rng))]
+
+
+def _horn(rng: np.random.Generator) -> list[Body]:
+    """A round bar that bends and thins."""
+    return [solid(_bent(rng, rng.uniform(0.05, 0.13), rng.uniform(0.014, 0.034)), any_colour(rng))]
+
+
+def _claw(rng: np.random.Generator) -> list[Body]:
+    """A rock with two to four horns."""
+    core = _pebble(rng, rng.uniform(0.018, 0.034))
+    bodies = [solid([core], any_colour(rng))]
+    for _ in range(int(rng.integers(2, 5))):
+        horn, turn = _bent(rng, rng.uniform(0.04, 0.08), rng.uniform(0.009, 0.018)), _rotation(rng)
+        parts = [Mesh(part.vertices @ turn.T + core.centroid, part.faces) for part in horn]
+        bodies.append(solid(parts, any_colour(rng)))
+    return bodies
+
+
+def _sail(rng: np.random.Generator) -> list[Body]:
+    """Two to four plates that meet in one edge, narrower and thinner away from it."""
+    wide, thick, bodies = rng.uniform(0.02, 0.05), rng.uniform(0.004, 0.009), []
+    angles = 2 * np.pi * (np.arange(number := int(rng.integers(2, 5))) + rng.uniform(-0.3, 0.3, number)) / number
+    for angle in angles:
+        root = np.array([(-thick, -wide), (thick, -wide), (thick, wide), (-thick, wide)])
+        end = root * (rng.uniform(0.3, 1.0), rng.uniform(0.05, 0.8)) + (0.0, rng.uniform(-0.5, 0.5) * wide)
+        rings = [np.column_stack([np.full(4, x), ring]) for x, ring in ((0.0, root), (rng.uniform(0.03, 0.075), end))]
+        bodies.append(solid([turned(loft(rings), angle)], any_colour(rng)))
+    return bodies
+
+
+def _bent(rng: np.random.Generator, length: float, radius: float) -> list[Mesh]:
+    """A bar from the origin on, its middle line an arc, of straight pieces whose outer sides meet."""
+    pieces = 7
+    bend, thinnest = min(rng.uniform(0.4, 3.0), length / (1.2 * radius)), rng.uniform(0.15, 0.8)
+    turns, radii = bend * np.arange(pieces) / pieces, radius * np.linspace(1.0, thinnest, pieces + 1)
+    steps = length / pieces * np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
+    ends = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
+    beyond = steps / length * pieces * np.tan(bend / pieces / 2)
+    return [
+        rod(start - r * more, end + following * more, (r, following))
+        for start, end, more, r, following in zip(ends[:-1], ends[1:], beyond, radii[:-1], radii[1:], strict=True)
+    ]
+
+
 def _bar(rng: np.random.Generator, length: float, size: float) -> Mesh:
     section = _outline(rng, 3, 4) * size
     far = section * rng.uniform(0.25, 1.0) + rng.uniform(-0.4, 0.4, 2) * size
@@ -135,11 +190,15 @@ def _rotation(rng: np.random.Generator) -> Array:
 
 FAMILIES: Mapping[str, Callable[[np.random.Generator], list[Body]]] = {
     "bundle": _bundle,
+    "claw": _claw,
     "elbow": _elbow,
+    "horn": _horn,
     "knuckle": _knuckle,
     "ridge": _ridge,
     "rock": _rock,
+    "sail": _sail,
     "shard": _shard,
+    "twist": _twist,
     "vane": _vane,
     "wedge": _wedge,
 }

@@ -38,9 +38,11 @@ def test_no_thing_leaves_the_workspace_and_the_parts_of_each_lie_on_another(
 ) -> None:
     for one in made["slopes-train"]:
         assert np.ptp(corners_of(parts_of(one)), axis=0).max() < 0.2, one.name
-    for family in ("bundle", "elbow", "knuckle", "ridge", "vane"):
+    for family in ("bundle", "elbow", "horn", "knuckle", "ridge", "sail", "twist", "vane"):
         for one in of(family, made):
             boxes = np.array([(part.vertices.min(axis=0), part.vertices.max(axis=0)) for part in parts_of(one)])
             low, high = boxes[1:, 0], boxes[1:, 1]
-            before = boxes[:-1] if family == "knuckle" else boxes[:1]  # in a row, or all on the first
+            before = (
+                boxes[:-1] if family in ("horn", "knuckle", "twist") else boxes[:1]
+            )  # in a row, or all on the first
             assert ((low <= before[:, 1]) & (before[:, 0] <= high)).all(), one.name
