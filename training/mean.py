@@ -42,12 +42,14 @@ def mean(
         WeightsError: a file cannot be read.
     """
     loaded = [networks.load(path) for path in files]
-    _, first = loaded[0]
-    for path, (_, header) in zip(files, loaded, strict=True):
-        if (header.network, header.configuration["network"]) != (first.network, first.configuration["network"]):
+    begun, first = loaded[0]
+    # Of the networks, not of the headers: an older file says nothing of a field that came after it.
+    configuration = configuration_of(begun)["network"]
+    for path, (other, header) in zip(files, loaded, strict=True):
+        if (header.network, configuration_of(other)["network"]) != (first.network, configuration):
             raise LabelsError(f"{path} holds another network than {files[0]}; give weights of one network")
     states = [one.state_dict() for one, _ in loaded]
-    network = networks.build(first.network, {**first.configuration["network"], **settings})
+    network = networks.build(first.network, {**configuration, **settings})
     network.load_state_dict({name: torch.stack([state[name] for state in states]).mean(dim=0) for name in states[0]})
     measures, of_all = validate(network, list(load_views(validation, network.preparation)), seed)
     training = {

@@ -67,3 +67,15 @@ def test_weights_of_different_networks_have_no_mean(tmp_path: Path) -> None:
     with pytest.raises(LabelsError, match=r"b\.safetensors holds another network than .*a\.safetensors"):
         mean([tmp_path / "a.safetensors", tmp_path / "b.safetensors"], [], tmp_path / "out.safetensors")
     assert not (tmp_path / "out.safetensors").exists()
+
+
+def test_a_file_from_before_a_field_of_the_configuration_is_of_the_same_network(tmp_path: Path) -> None:
+    older, newer, out = tmp_path / "a.safetensors", tmp_path / "b.safetensors", tmp_path / "mean.safetensors"
+    state = saved(older, "tesnet", 0, 1).state_dict()
+    saved(newer, "tesnet", 1, 2)
+    configuration = configuration_of(networks.build("tesnet"))
+    del configuration["network"]["second_look"]
+    weights.save(older, state, weights.Header("tesnet", "1", configuration, (1.0, 0.0), {"epoch": 1}))
+    folder = write(tmp_path / "labels", [labelled_view(seed) for seed in range(3)])
+    told = mean([older, newer], [folder], out)
+    assert [one["training"] for one in told["mean_of"]] == [{"epoch": 1}, {"epoch": 2}]
