@@ -22,6 +22,9 @@ NARROWEST = 0.03
 PALM_OVERLAP = 0.004
 """Metres of the usable finger depth that the hand's body covers."""
 
+FAR_SWING = 0.03
+"""Metres: tips that advance as far or farther from open to closed hold otherwise than others (training/NOTES.md)."""
+
 _TAPERED = {
     "finger_thickness": "finger_tip_thickness",
     "finger_breadth": "finger_tip_breadth",
@@ -191,6 +194,11 @@ class Gripper:
     def travel(self) -> float:
         """Metres by which the tips advance along z at most as the open hand closes."""
         return float(self.tcp_at(self.farthest_width) - self.hand_to_tcp)
+
+    @property
+    def swings_far(self) -> bool:
+        """Whether the tips advance so far as the hand closes that it holds otherwise than other hands."""
+        return self.travel >= FAR_SWING
 
     @property
     def farthest_width(self) -> float:

@@ -13,9 +13,6 @@ from torch import Tensor
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 
-FAR_SWING = 0.03
-"""Hands whose tips advance less from open to closed do not drop what they hold so (training/NOTES.md)."""
-
 _FIRST = 0.003
 """Points this near to the first that a pad meets count as met, too."""
 
@@ -41,7 +38,7 @@ _THIN = (0.026, 0.018)
 def poor_pinch(cloud: PreparedCloud, candidates: Candidates, index: Tensor) -> Tensor:
     """How much each hand would hold something by a rim that it drops, from 0 to 1 (C,).
 
-    Zero for hands that swing less than `FAR_SWING`, and where nothing lies between the fingers.
+    Zero for hands that do not swing far (`Gripper.swings_far`), and where nothing lies between the fingers.
 
     Args:
         cloud: P points.
@@ -49,7 +46,7 @@ def poor_pinch(cloud: PreparedCloud, candidates: Candidates, index: Tensor) -> T
         index: (C, M) of points near the fingers; of more than M some.
     """
     hand, poses = candidates.gripper, candidates.Ts_canonical_grasp
-    if hand.travel < FAR_SWING:
+    if not hand.swings_far:
         return candidates.widths.new_zeros(len(candidates))
     rotation = poses[:, :3, :3]
     x, y, z = ((cloud.points[index] - poses[:, None, :3, 3]) @ rotation).unbind(dim=2)

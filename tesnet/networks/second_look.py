@@ -13,7 +13,6 @@ from torch import Tensor, nn
 from tesnet.candidates import Candidates
 from tesnet.cloud import PreparedCloud
 from tesnet.geometry import Gripper
-from tesnet.networks.rims import FAR_SWING
 from tesnet.points import points_in_grasp_frames
 
 CELL = 0.0055
@@ -50,7 +49,7 @@ def looks_again(hand: Gripper) -> bool:
     Hands whose tips swing far pinch otherwise, and among its samples there were too few: where it looks again at these,
     twice as much slips out of them (training/NOTES.md).
     """
-    return hand.travel < FAR_SWING
+    return not hand.swings_far
 
 
 class SecondLook(nn.Module):

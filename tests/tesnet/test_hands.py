@@ -77,6 +77,7 @@ def test_travel_is_that_of_the_farthest_tip_while_the_hand_closes(name: str) -> 
     rises = [from_base(hand, width) for width in np.linspace(0, hand.max_width, 2001)]
     assert hand.travel == pytest.approx(max(rises) - rises[-1], abs=1e-6)
     assert (hand.travel > 0) == (name in ARCS)
+    assert hand.swings_far == (name in {"rg2", "rg6"})
     widths = torch.linspace(0, hand.max_width, 7, dtype=torch.float64)
     expected = [from_base(hand, width) for width in widths.tolist()]
     np.testing.assert_allclose(np.broadcast_to(hand.tcp_at(widths), 7), expected, atol=1e-12)
