@@ -64,7 +64,8 @@ class Target(RequestPart):
     indices: Sequence[Annotated[int, Field(ge=0, lt=2**31)]] | None = Field(
         default=None,
         description="Numbers of the target's points, from 0: rows of the posted cloud, or pixels of a depth image row "
-        "by row. Mark all points of the object: a cell of the voxel grid is the target's where half of its points are.",
+        "by row. Mark all points of the object: a cell of the voxel grid is the target's where half of its points are, "
+        "and fingers close on nothing that lies 5 mm or more beside it.",
     )
     label: Annotated[int, Field(ge=0, le=65_535)] | None = Field(
         default=None, description="Number of the target's pixels in the file `mask`, which comes with a depth image."
@@ -343,7 +344,7 @@ class RejectedOut(ResponsePart):
         description="The hand would come from below or, without `up`, from behind what the camera sees."
     )
     approach: int = Field(description="The direction of travel is outside the `approach` cone.")
-    target: int = Field(description="Not on the target.")
+    target: int = Field(description="Not on the target, or the fingers would close on something beside it as well.")
     collision: int = Field(
         description="The hand would collide with observed points, or with the shadow behind them (`unseen`)."
     )

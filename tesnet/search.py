@@ -8,12 +8,15 @@ from __future__ import annotations
 from collections.abc import Callable
 from dataclasses import dataclass, replace
 
+import torch
 from torch import Tensor
 
+from tesnet.beside_target import closes_on_others
 from tesnet.candidates import CandidateConfig, Candidates, generate
 from tesnet.cloud import PreparedCloud
 from tesnet.collision import blocked, palm_blocked
 from tesnet.fitting import fitted, reach_of_fitting
+from tesnet.geometry import Box
 from tesnet.outline import Outline
 from tesnet.query import GraspQuery
 
@@ -68,4 +71,9 @@ def search(
     found = replace(found, Ts_canonical_grasp=poses, widths=widths)
     is_free = ~lost
     is_free[~lost] = ~blocked(cloud, found.select(~lost), query.unseen, between)
+    if cloud.on_target is not None and not isinstance(query.target, Box):
+        alone = torch.ones_like(is_free)
+        alone[is_free] = ~closes_on_others(cloud, found.select(is_free), between)
+        rejected = rejected | {"target": rejected.get("target", 0) + int((~alone).sum())}
+        found, is_free = found.select(alone), is_free[alone]
     return Found(found, is_free, rejected | {"collision": int((~is_free).sum())})
