@@ -455,6 +455,11 @@ def _inside(points: Tensor, box: Box) -> Tensor:
     return in_box(points, low, high)
 
 
+def posted_points(query: GraspQuery, T_cloud_canonical: Pose, device: torch.device) -> Tensor:
+    """Every point (N, 3) of the query, its support's included, in the canonical frame."""
+    return in_canonical_frame(torch.from_numpy(query.points.copy()).to(device), T_cloud_canonical)
+
+
 def in_canonical_frame(points: Tensor, T_cloud_canonical: Pose) -> Tensor:
     """Points (N, 3) of the query's frame in the canonical one."""
     rotation = torch.tensor(T_cloud_canonical.rotation, device=points.device)

@@ -12,7 +12,7 @@ import torch
 from torch import Tensor
 from torch.nn.functional import normalize
 
-from tesnet.cloud import SUPPORT_NOISE, PreparedCloud, in_canonical_frame
+from tesnet.cloud import SUPPORT_NOISE, PreparedCloud, posted_points
 from tesnet.points import smallest_eigenvector
 from tesnet.query import GraspQuery
 from tesnet.ranges import RangeImage, range_image
@@ -176,7 +176,7 @@ def _falls_away(cloud: PreparedCloud, query: GraspQuery, edge: Tensor, outward: 
     """Mask (E,) of edge points beyond which every posted point is farther away, and one is, or the removed plane."""
     steps = torch.tensor(_BESIDE, device=edge.device)
     places = cloud.points[edge][:, None] + steps[:, None] * outward[:, None]
-    posted = in_canonical_frame(torch.from_numpy(query.points.copy()).to(edge.device), cloud.T_cloud_canonical)
+    posted = posted_points(query, cloud.T_cloud_canonical, edge.device)
     to_viewpoints = normalize(cloud.viewpoints[None] - cloud.points[edge][:, None], dim=2)
     viewer = (to_viewpoints * cloud.view_directions[edge][:, None]).sum(dim=2).argmax(dim=1)
     gap = torch.full(places.shape[:2], torch.nan, device=edge.device)

@@ -251,8 +251,7 @@ class GraspPredictor:
         clock.start()
         clock.check()
         found, scores = self._best_search(proposal, features)
-        posted = torch.from_numpy(query.points.copy()).to(self.device)
-        posted = cloud.in_canonical_frame(posted, prepared.T_cloud_canonical)
+        posted = cloud.posted_points(query, prepared.T_cloud_canonical, self.device)
         found, scores, ranked = _ranked_clear(posted, found, scores, query, clock)
         last = {"min_score": ranked.below_min_score, "duplicates": ranked.duplicates}
         rejected = dict.fromkeys(REJECTIONS, 0) | found.rejected | last
