@@ -114,7 +114,7 @@ def _first_look(file: Path) -> TesNet:
 
 
 def _sample_scene(job: SceneFile, models: Mapping[str, ObjectModel], *, file: Path) -> None:
-    views = list(_views_of(job.scene, models, _first_look(file)))
+    views = _views_of(job.scene, models, _first_look(file))
     columns = [np.concatenate(column) for column in zip(*views, strict=True)] if views else [np.zeros((0, INPUTS))] * 4
     write_samples(job.path, seen=columns[0], logits=columns[1], outcomes=columns[2], views=columns[3])
 

@@ -70,8 +70,7 @@ def _vane(rng: np.random.Generator) -> list[Body]:
         root = np.array([(-wide, -thick), (wide, -thick), (wide, thick), (-wide, thick)])
         end = root * (rng.uniform(0.3, 1.1), rng.uniform(0.2, 0.7))
         blade = loft([at_height(root, 0.0), at_height(end, reach)])
-        turn = _rotation(rng)
-        bodies.append(solid([Mesh(blade.vertices @ turn.T + core.centroid, blade.faces)], any_colour(rng)))
+        bodies.append(solid([_placed(blade, _rotation(rng), core.centroid)], any_colour(rng)))
     return bodies
 
 
@@ -118,8 +117,7 @@ def _claw(rng: np.random.Generator) -> list[Body]:
     bodies = [solid([core], any_colour(rng))]
     for _ in range(int(rng.integers(2, 5))):
         horn, turn = _bent(rng, rng.uniform(0.04, 0.08), rng.uniform(0.009, 0.018)), _rotation(rng)
-        parts = [Mesh(part.vertices @ turn.T + core.centroid, part.faces) for part in horn]
-        bodies.append(solid(parts, any_colour(rng)))
+        bodies.append(solid([_placed(part, turn, core.centroid) for part in horn], any_colour(rng)))
     return bodies
 
 
@@ -140,9 +138,9 @@ def _bent(rng: np.random.Generator, length: float, radius: float) -> list[Mesh]:
     pieces = 7
     bend, thinnest = min(rng.uniform(0.4, 3.0), length / (1.2 * radius)), rng.uniform(0.15, 0.8)
     turns, radii = bend * np.arange(pieces) / pieces, radius * np.linspace(1.0, thinnest, pieces + 1)
-    steps = length / pieces * np.column_stack([np.cos(turns), np.sin(turns), 0.0 * turns])
-    ends = np.concatenate([np.zeros((1, 3)), np.cumsum(steps, axis=0)])
-    beyond = steps / length * pieces * np.tan(bend / pieces / 2)
+    directions = np.column_stack([np.cos(turns), np.sin(turns), np.zeros(pieces)])
+    ends = np.concatenate([np.zeros((1, 3)), np.cumsum(length / pieces * directions, axis=0)])
+    beyond = directions * np.tan(bend / pieces / 2)
     return [
         rod(start - r * more, end + following * more, (r, following))
         for start, end, more, r, following in zip(ends[:-1], ends[1:], beyond, radii[:-1], radii[1:], strict=True)
@@ -179,7 +177,12 @@ def _outline(rng: np.random.Generator, fewest: int, most: int) -> Array:
 
 def _tumbled(rng: np.random.Generator, mesh: Mesh, offset: Array) -> Mesh:
     """A mesh turned anyhow about its centroid, which then lies at the offset."""
-    return Mesh((mesh.vertices - mesh.centroid) @ _rotation(rng).T + offset, mesh.faces)
+    return _placed(mesh.moved(-mesh.centroid), _rotation(rng), offset)
+
+
+def _placed(mesh: Mesh, turn: Array, offset: Array) -> Mesh:
+    """A mesh turned about the origin by a rotation (3, 3) and then moved."""
+    return Mesh(mesh.vertices @ turn.T + offset, mesh.faces)
 
 
 def _rotation(rng: np.random.Generator) -> Array:

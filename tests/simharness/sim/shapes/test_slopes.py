@@ -42,7 +42,6 @@ def test_no_thing_leaves_the_workspace_and_the_parts_of_each_lie_on_another(
         for one in of(family, made):
             boxes = np.array([(part.vertices.min(axis=0), part.vertices.max(axis=0)) for part in parts_of(one)])
             low, high = boxes[1:, 0], boxes[1:, 1]
-            before = (
-                boxes[:-1] if family in ("horn", "knuckle", "twist") else boxes[:1]
-            )  # in a row, or all on the first
+            in_a_row = family in ("horn", "knuckle", "twist")
+            before = boxes[:-1] if in_a_row else boxes[:1]
             assert ((low <= before[:, 1]) & (before[:, 0] <= high)).all(), one.name
