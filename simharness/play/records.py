@@ -21,7 +21,11 @@ ROUND_ENDS: tuple[RoundEnd, ...] = get_args(RoundEnd)
 
 OBJECTS_PER_ROUND = 5
 FAILURES_IN_A_ROW = 2
-NO_GRASPS_IN_A_ROW = 3
+LOOKS_IN_A_ROW = 3
+"""So many looks at a table as it stands; if the last gives no grasp either, the round is over."""
+
+UNSURE = "unsure"
+"""Reason of an observation whose grasps score too little for who looks again (`look_again_below`)."""
 
 _CALIBRATED, _CORRECTED = "calibrate", "depth is multiplied by"
 """How the service's warning of a correction begins, and what it says and others do not."""
@@ -170,7 +174,7 @@ class AttemptRecord:
 
 @dataclass(frozen=True, slots=True)
 class NoGraspRecord:
-    """One observation that gave no grasp: its number in the round, the service's reason, counts and times.
+    """One observation after which no grasp was tried: its number in the round, the reason, the service's counts and times.
 
     `latency` is None where the camera saw nothing and no request was made.
     """
@@ -209,7 +213,7 @@ class RoundRecord:
         objects: names of the objects present after the scene had settled.
         ended: why it ended.
         attempts: in the order of execution.
-        no_grasps: observations that gave no grasp, in order.
+        no_grasps: observations after which none was tried, in order.
     """
 
     seed: int

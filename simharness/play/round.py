@@ -15,8 +15,9 @@ from jaxtyping import Float64
 
 from simharness.play.records import (
     FAILURES_IN_A_ROW,
-    NO_GRASPS_IN_A_ROW,
+    LOOKS_IN_A_ROW,
     OBJECTS_PER_ROUND,
+    UNSURE,
     AttemptRecord,
     Latency,
     NoGraspRecord,
@@ -24,7 +25,7 @@ from simharness.play.records import (
     RoundRecord,
 )
 from simharness.play.settings import RunSettings
-from simharness.sim.camera import PRESET_SENSOR, Observation, Stand, observe
+from simharness.sim.camera import PRESET_SENSOR, Observation, Stand, observe, together
 from simharness.sim.execute import Outcome, attempt
 from simharness.sim.hand import Hand
 from simharness.sim.objects import ObjectModel
@@ -248,35 +249,44 @@ class _Table:
 
     def clear(self, planner: GraspPlanner) -> RoundEnd:
         """Play until the round is over."""
-        failures = empty_plans = observation = 0
+        failures = observation = 0
+        looks: list[Observation] = []  # since the last attempt: nothing has moved
         while self._world.objects:
-            observed = self._observe(planner, observation)
+            looks.append(self._look(observation))
+            observed = self._ask(planner, observation, looks)
             observation += 1
-            if not len(observed.plan):
-                plan = observed.plan
-                self.no_grasps.append(NoGraspRecord(observed.observation, plan.reason, plan.counts, plan.latency))
-                empty_plans += 1
-                if empty_plans == NO_GRASPS_IN_A_ROW:
+            plan = observed.plan
+            unsure = self._is_unsure(plan) and len(looks) < LOOKS_IN_A_ROW
+            if unsure or not len(plan):
+                reason = UNSURE if len(plan) else plan.reason
+                self.no_grasps.append(NoGraspRecord(observed.observation, reason, plan.counts, plan.latency))
+                if len(looks) == LOOKS_IN_A_ROW:
                     return "no_grasps"
                 continue
-            empty_plans = 0
+            looks.clear()
             failures = 0 if self._attempt(observed).success else failures + 1
             if failures == FAILURES_IN_A_ROW:
                 return "two_failures"
         return "empty"
 
-    def _observe(self, planner: GraspPlanner, observation: int) -> Observed:
-        rng = camera_rng(self._seed, self._round, observation)
-        view = observe(
+    def _look(self, observation: int) -> Observation:
+        return observe(
             self._world,
             self._settings.camera,
-            rng,
+            camera_rng(self._seed, self._round, observation),
             self._sensor,
             stand=self._stand,
             table_in_view=self._settings.shows_table,
             voxel_size=self._settings.voxel_size,
             segmentation=self._segmentation,
         )
+
+    def _is_unsure(self, plan: Plan) -> bool:
+        least = self._settings.look_again_below
+        return least is not None and len(plan) > 0 and bool(plan.scores[0] < least)
+
+    def _ask(self, planner: GraspPlanner, observation: int, looks: Sequence[Observation]) -> Observed:
+        view = looks[-1] if self._settings.look_again_below is None else together(looks)
         plan = planner.plan(view, request_seed(self._seed, self._round, observation))
         present = {body: self._names[body] for body in self._world.objects}
         observed = Observed(self._seed, self._round, observation, view, plan, present, self._hand.gripper)

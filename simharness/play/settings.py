@@ -195,6 +195,17 @@ class RunSettings:
         ),
     ] = None
 
+    look_again_below: Annotated[
+        float | None,
+        Flag(
+            "model",
+            "while no grasp scores as much, look again from elsewhere, fuse what was seen, and try the best grasp after "
+            "three looks (default: one look for each attempt)",
+            "P",
+            within=Interval(0, 1, "a probability"),
+        ),
+    ] = None
+
     @property
     def hand(self) -> KnownHand:
         """The hand that `gripper` names."""

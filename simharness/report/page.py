@@ -40,6 +40,7 @@ _UNSET = {
     "table_in_view": "with calibration",
     "calibrate": "no",
     "min_score": "every grasp is tried",
+    "look_again_below": "one look for each attempt",
     "url": "started for the run",
     "service_threads": "unknown",
     "device": "unknown",

@@ -236,6 +236,23 @@ def observe_from(
     )
 
 
+def together(looks: Sequence[Observation]) -> Observation:
+    """Several looks at a scene in which nothing has moved, as one: all points, seen from all viewpoints.
+
+    Args:
+        looks: one or more; the last tells how high the table is.
+    """
+    if len(looks) == 1:
+        return looks[0]
+    return Observation(
+        np.concatenate([look.points_world for look in looks]),
+        np.concatenate([look.viewpoints for look in looks]),
+        np.concatenate([look.Ts_world_camera for look in looks]),
+        tuple(image for look in looks for image in look.images),
+        looks[-1].table_height,
+    )
+
+
 def perception_box(table_height: float) -> Box:
     """What a planner is shown that believes the table to be so high, metres."""
     minimum = PERCEPTION_BOX.minimum + np.array([0.0, 0.0, table_height - TABLE_HEIGHT])

@@ -33,18 +33,20 @@ class TopDown:
 
 
 class Scripted:
-    """Says in turn what it was given: a reason for no grasp, or None for a grasp in empty air."""
+    """Says in turn what it was given: a reason for no grasp, or a score (None is 0.5) of a grasp in empty air."""
 
-    def __init__(self, script: Iterable[str | None]) -> None:
+    def __init__(self, script: Iterable[str | float | None]) -> None:
         self._script = iter(script)
+        self.seen: list[Observation] = []
 
     def plan(self, observation: Observation, seed: int) -> Plan:
-        reason = next(self._script)
-        if reason is not None:
-            return Plan.nothing(reason)
+        self.seen.append(observation)
+        said = next(self._script)
+        if isinstance(said, str):
+            return Plan.nothing(said)
         air = np.diag([1.0, -1.0, -1.0, 1.0])
         air[:3, 3] = [0.15, 0.15, 0.6]
-        return Plan(air[None], np.array([0.5]), np.array([0.08]), 2.0)
+        return Plan(air[None], np.array([0.5 if said is None else said]), np.array([0.08]), 2.0)
 
 
 class Alternating:

@@ -9,6 +9,7 @@ import pytest
 
 from simharness.play import round as playing
 from simharness.play.records import RoundRecord
+from simharness.play.replay import RecordedPlanner
 from simharness.play.round import (
     Attempted,
     Observed,
@@ -97,6 +98,41 @@ def test_three_observations_in_a_row_without_a_grasp_end_a_round(
     assert record.ended == "no_grasps"
     assert [entry.reason for entry in record.no_grasps] == [reason for reason in script if reason is not None]
     assert len(record.attempts) == 1
+
+
+def test_who_is_unsure_looks_again_and_asks_about_all_that_was_seen(
+    objects: tuple[ObjectModel, ...], make_settings: Any
+) -> None:
+    """A score as high as asked is enough; a third look is the last; after an attempt nothing of before counts."""
+    planner = Scripted([0.3, "no_candidates", 0.4, 0.3, 0.7])
+    record = play_round(make_settings(look_again_below=0.7), objects, planner, 0, 2)
+    assert record.ended == "two_failures"
+    assert [(attempt.observation, attempt.score) for attempt in record.attempts] == [(2, 0.4), (4, 0.7)]
+    assert [(entry.observation, entry.reason) for entry in record.no_grasps] == [
+        (0, "unsure"),
+        (1, "no_candidates"),
+        (3, "unsure"),
+    ]
+    views = [len(seen.viewpoints) for seen in planner.seen]
+    assert views == [1, 2, 3, 1, 2]
+    assert [len(attempt.viewpoints) for attempt in record.attempts] == [3, 2]
+    first, third = planner.seen[0], planner.seen[2]
+    np.testing.assert_array_equal(third.points_world[: len(first.points_world)], first.points_world)
+
+
+def test_three_looks_at_last_without_a_grasp_end_a_round(objects: tuple[ObjectModel, ...], make_settings: Any) -> None:
+    planner = Scripted([0.3, 0.3, "all_in_collision"])
+    record = play_round(make_settings(look_again_below=0.7), objects, planner, 0, 2)
+    assert (record.ended, record.attempts) == ("no_grasps", ())
+    assert [entry.reason for entry in record.no_grasps] == ["unsure", "unsure", "all_in_collision"]
+
+
+def test_a_round_with_looks_again_is_replayed(objects: tuple[ObjectModel, ...], make_settings: Any) -> None:
+    settings = make_settings(look_again_below=0.7)
+    record = play_round(settings, objects, Scripted([0.3, 0.3, 0.4, 0.8]), 0, 2)
+    again = play_round(settings, objects, RecordedPlanner(record), 0, 2)
+    assert [attempt.viewpoints for attempt in again.attempts] == [attempt.viewpoints for attempt in record.attempts]
+    assert [entry.observation for entry in again.no_grasps] == [0, 1]
 
 
 def test_every_observation_has_its_own_camera_and_request_seed(

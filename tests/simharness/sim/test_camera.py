@@ -23,6 +23,7 @@ from simharness.sim.camera import (
     render,
     sample_camera,
     thin,
+    together,
 )
 from simharness.sim.scene import PERCEPTION_BOX, TABLE_HEIGHT, restore_scene
 from simharness.sim.sensors.calibration import Calibration
@@ -167,6 +168,20 @@ def test_fused_views_show_every_side_of_the_box(world: World) -> None:
     for low, high, axis in ((0.13, 0.17, 0), (0.12, 0.18, 1)):
         assert (np.abs(points[:, axis] - low) < 0.002).sum() > 100
         assert (np.abs(points[:, axis] - high) < 0.002).sum() > 100
+
+
+def test_several_looks_together_are_all_that_each_of_them_saw(world: World) -> None:
+    first = observe(world, "random", np.random.default_rng(0))
+    wrong = Sensor(calibration=Calibration(translation=0.0, rotation_deg=0.0, table_height=0.005))
+    second = observe(world, "random", np.random.default_rng(1), wrong)
+    both = together([first, second])
+    for name in ("points_world", "viewpoints", "Ts_world_camera"):
+        np.testing.assert_array_equal(
+            getattr(both, name), np.concatenate([getattr(first, name), getattr(second, name)])
+        )
+    assert both.images == (*first.images, *second.images)
+    assert both.table_height == second.table_height != TABLE_HEIGHT
+    assert together([first]) is first
 
 
 def test_an_unknown_preset_is_refused_with_the_valid_ones() -> None:
