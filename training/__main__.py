@@ -27,7 +27,7 @@ from training.generate import GenerateConfig, generate
 from training.mean import mean
 from training.second_look import EPOCHS as SECOND_LOOK_EPOCHS
 from training.second_look import learn_second_look
-from training.viewing import MoreViews
+from training.viewing import RANDOM, RANDOM_POSE, MoreViews
 from training.views import LabelsError
 
 
@@ -187,7 +187,7 @@ def _add_camera(parser: argparse.ArgumentParser, whose: str) -> None:
         default="random",
         help=f"{whose}; 'any': one to four views from anywhere",
     )
-    parser.add_argument("--sensor", choices=(*SENSORS, "random"), help=f"{whose}; default: the camera's own")
+    parser.add_argument("--sensor", choices=(*SENSORS, RANDOM, RANDOM_POSE), help=f"{whose}; default: the camera's own")
 
 
 def _add_more_views(parser: argparse.ArgumentParser) -> None:

@@ -12,6 +12,7 @@ import torch
 from simharness.sim.camera import PRESET_SENSOR, Observation, Preset, Stand, observe_from, sample_camera
 from simharness.sim.protocol import query_about
 from simharness.sim.scene import WORKSPACE
+from simharness.sim.sensors.calibration import Calibration
 from simharness.sim.sensors.catalogue import D435, SENSORS, SensorName, random_sensor
 from simharness.sim.sensors.sensor import Sensor
 from simharness.sim.sensors.stereo import Stereo
@@ -24,7 +25,10 @@ from tesnet.query import GraspQuery
 Camera = Preset | Literal["any"]
 """A preset, or one to four views from any place that a camera may have."""
 
-RANDOM = "random"
+RANDOM, RANDOM_POSE = "random", "random-pose"
+"""Sensors that are drawn for each view; the poses of the latter's cameras are not quite what they are believed to be."""
+
+_WRONG_POSE = Calibration(translation=0.008, rotation_deg=1.5)
 
 Shows = Literal["box", "table", "open"]
 """The cloud that is asked about: cropped to the workspace, as the protocol has it; all that is seen, with the workspace
@@ -48,7 +52,7 @@ class Viewing:
 
     Args:
         cameras: T_world_camera of each view; several are fused into one cloud.
-        sensor: name in `SENSORS`, or `random`: then it is drawn from `seed`.
+        sensor: name in `SENSORS`, or `random` or `random-pose`: then it is drawn from `seed`.
         seed: of the sensor and its noise.
         shows: what is asked about.
     """
@@ -114,26 +118,31 @@ def draw_viewing(camera: Camera, sensor: str | None, rng: np.random.Generator) -
     """A way to look at a scene.
 
     `any` has one view in 0.55 of the cases, up to four otherwise, each 0 to 80 degrees from straight above and 0.35 to
-    1.2 m from the middle of the table (sensors of long focus from 0.5 m), and shows the table in a half of them.
+    1.2 m from the middle of the table (sensors of long focus from 0.5 m), and shows the table in a half of them; with
+    `random-pose` always, for who fears a wrong pose asks to calibrate.
 
     Args:
         camera: a preset or `any`.
-        sensor: its name, or `random`; None is the preset's own (of `any` that of the protocol).
+        sensor: its name, `random` or `random-pose`; None is the preset's own (of `any` that of the protocol).
         rng: source of all that is random about it.
     """
     seed = int(rng.integers(2**32))
     if camera != "any":
         name = PRESET_SENSOR[camera] if sensor is None else sensor
-        return Viewing(sample_camera(camera, rng), name, seed)
+        return Viewing(sample_camera(camera, rng), name, seed, "table" if name == RANDOM_POSE else "box")
     name = PRESET_SENSOR["random"] if sensor is None else sensor
     drawn = sensor_of(name, np.random.default_rng(seed))
     count = int(rng.choice(len(_SHARES_OF_COUNTS), p=_SHARES_OF_COUNTS)) + 1
-    shows = SHOWS[int(rng.choice(len(SHOWS), p=_SHARES_OF_SHOWS))]
+    shares = np.array(_SHARES_OF_SHOWS)
+    shares[0] *= name != RANDOM_POSE
+    shows = SHOWS[int(rng.choice(len(SHOWS), p=shares / shares.sum()))]
     return Viewing(tuple(_anywhere(drawn, rng) for _ in range(count)), name, seed, shows)
 
 
 def sensor_of(name: str, rng: np.random.Generator) -> Sensor:
-    """A sensor by its name; nothing is drawn unless it is `random`."""
+    """A sensor by its name; nothing is drawn unless it is `random` or `random-pose`."""
+    if name == RANDOM_POSE:
+        return replace(random_sensor(rng), calibration=_WRONG_POSE)
     return random_sensor(rng) if name == RANDOM else SENSORS[cast(SensorName, name)]
 
 

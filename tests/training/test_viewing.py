@@ -12,7 +12,7 @@ from simharness.sim.scene import TABLE_HEIGHT, WORKSPACE, restore_scene
 from simharness.sim.sensors.catalogue import SENSORS
 from simharness.sim.world import World, data_path
 from tesnet.hands import HANDS
-from training.viewing import SHOWS, MoreViews, Shows, Viewing, draw_viewing, sensor_of
+from training.viewing import SHOWS, Camera, MoreViews, Shows, Viewing, draw_viewing, sensor_of
 
 pytestmark = pytest.mark.sim
 MIDDLE = np.array([0.15, 0.15, 0.05])
@@ -81,6 +81,15 @@ def test_a_seed_draws_one_sensor() -> None:
     assert sensor_of("d435", np.random.default_rng(0)) is SENSORS["d435"]
     one, same, other = (sensor_of("random", np.random.default_rng(seed)) for seed in (1, 1, 2))
     assert one == same != other
+    displaced, exact = (sensor_of(name, np.random.default_rng(1)) for name in ("random-pose", "random"))
+    assert (displaced.depth, displaced.point_sigma) == (exact.depth, exact.point_sigma)
+    assert displaced.calibration.translation > 0 == exact.calibration.translation
+
+
+@pytest.mark.parametrize("camera", ["any", "random"])
+def test_who_fears_a_wrong_pose_shows_the_table(camera: Camera) -> None:
+    shown = {draw_viewing(camera, "random-pose", np.random.default_rng(seed)).shows for seed in range(40)}
+    assert shown == ({"table", "open"} if camera == "any" else {"table"})
 
 
 @pytest.fixture
