@@ -26,7 +26,7 @@ Camera = Preset | Literal["any"]
 """A preset, or one to four views from any place that a camera may have."""
 
 RANDOM, RANDOM_POSE = "random", "random-pose"
-"""Sensors that are drawn for each view; the poses of the latter's cameras are not quite what they are believed to be."""
+"""Sensors that are drawn for each view; those of the latter do not stand quite where they are believed to."""
 
 _WRONG_POSE = Calibration(translation=0.008, rotation_deg=1.5)
 

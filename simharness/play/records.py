@@ -174,7 +174,7 @@ class AttemptRecord:
 
 @dataclass(frozen=True, slots=True)
 class NoGraspRecord:
-    """One observation after which no grasp was tried: its number in the round, the reason, the service's counts and times.
+    """One observation after which no grasp was tried: its number in the round, why, the answer's counts and times.
 
     `latency` is None where the camera saw nothing and no request was made.
     """

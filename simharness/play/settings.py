@@ -199,8 +199,8 @@ class RunSettings:
         float | None,
         Flag(
             "model",
-            "while no grasp scores as much, look again from elsewhere, fuse what was seen, and try the best grasp after "
-            "three looks (default: one look for each attempt)",
+            "while no grasp scores as much, look again from elsewhere and fuse what was seen; after three looks the "
+            "best grasp is tried (default: one look for each attempt)",
             "P",
             within=Interval(0, 1, "a probability"),
         ),
