@@ -125,6 +125,7 @@ def save_scene(
             "up": None if cloud.up is None else cloud.up.tolist(),
             "support_height": cloud.support_height,
             "sides": cloud.sides.tolist(),
+            "pose_in_doubt": cloud.pose_in_doubt,
             "T_cloud_canonical": cloud.T_cloud_canonical.matrix.tolist(),
             "scene": view.scene,
             "gripper": gripper_values(view.gripper),
@@ -198,6 +199,7 @@ def _view(arrays: Mapping[str, NDArray[Any]], number: int) -> LabelledView:
         support_height=frame["support_height"],
         sides=torch.tensor(frame["sides"]).reshape(-1, 4),
         T_cloud_canonical=Pose.from_matrix(frame["T_cloud_canonical"]),
+        pose_in_doubt=frame.get("pose_in_doubt", False),  # files of before 0.6.8 do not say
     )
     if f"{number}/poses" in arrays:
         poses, widths = _whole(tensor("poses", torch.float32)), tensor("widths", torch.float32)

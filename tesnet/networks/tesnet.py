@@ -53,6 +53,7 @@ class TesNetConfig:
         around_patches, around_region: the same for patches in the hand's wider surroundings.
         probe_channels: width of the layer over what the camera saw at the hand's probes.
         told: whether it is told the hand and the cloud's noise (`told_inputs`). Without, it knows of them what it sees.
+        doubt: whether it is told besides whether the camera may not stand where it is said to.
         caution: log odds that a candidate would lose whose fingers stood wholly in what no camera saw; it loses the
             part of them that stands there. Not in training: on things that fit into a hand, behind what is seen there
             is nothing, and so a network learns; on things wider than the hand there is.
@@ -81,6 +82,7 @@ class TesNetConfig:
     around_patches: int = 48
     around_region: Region = (0.035, 0.085, 0.060, 0.045)
     told: bool = False
+    doubt: bool = False
     caution: float = 0.0
     mirrored: int = 0
     evenness: float = 0.0
@@ -407,7 +409,8 @@ class Told(nn.Module):
     def __init__(self, config: TesNetConfig) -> None:
         super().__init__()
         self.widths = [config.region_channels[0], config.region_channels[0], config.head_channels[0]]
-        self.layer = nn.Linear(TOLD_INPUTS, sum(self.widths), bias=False)
+        self.doubt = config.doubt
+        self.layer = nn.Linear(TOLD_INPUTS + config.doubt, sum(self.widths), bias=False)
         nn.init.zeros_(self.layer.weight)
 
     def forward(self, cloud: PreparedCloud, candidates: Candidates, at_fingers: RegionMembers) -> Sequence[Tensor]:
@@ -421,9 +424,10 @@ class Told(nn.Module):
         poses = candidates.Ts_canonical_grasp
         points = cloud.points.index_select(0, at_fingers.index.flatten()).view(*at_fingers.index.shape, 3)
         between = (points - poses[:, None, :3, 3]) @ poses[:, :3, :3]
-        parts: Sequence[Tensor] = self.layer(told_inputs(cloud, candidates, between, at_fingers.total > 0)).split(
-            self.widths, dim=1
-        )
+        told = told_inputs(cloud, candidates, between, at_fingers.total > 0)
+        if self.doubt:
+            told = torch.cat([told, told.new_full((len(told), 1), float(cloud.pose_in_doubt))], dim=1)
+        parts: Sequence[Tensor] = self.layer(told).split(self.widths, dim=1)
         return parts
 
 

@@ -18,7 +18,8 @@ from training.views import LabelsError, StoredViews, load_scene, load_views, sav
 
 def test_labels_round_trip(tmp_path: Path) -> None:
     first = replace(labelled_view(0), collision_free=torch.arange(60) % 3 > 0)
-    second = replace(labelled_view(1, count=40), sensor="d435")
+    second = labelled_view(1, count=40)
+    second = replace(second, sensor="d435", cloud=replace(second.cloud, pose_in_doubt=True))
     path = tmp_path / "scene_0000000.npz"
     save_scene(path, {"seed": 3, "objects": ["a", "b"]}, [first, second])
     description, views = load_scene(path)
@@ -49,6 +50,7 @@ def test_labels_round_trip(tmp_path: Path) -> None:
         assert after.cloud.up is not None
         torch.testing.assert_close(after.cloud.up, before.cloud.up)
         assert after.cloud.support_height == before.cloud.support_height
+        assert after.cloud.pose_in_doubt == before.cloud.pose_in_doubt
         assert len(after.cloud.sides) == 4
         assert torch.equal(after.cloud.sides, before.cloud.sides)
         np.testing.assert_array_equal(after.cloud.T_cloud_canonical.matrix, before.cloud.T_cloud_canonical.matrix)

@@ -365,6 +365,20 @@ def test_a_network_that_is_told_scores_at_first_as_one_that_is_not(name: str) ->
     assert torch.equal(told_score(network, found), told_score(fresh_network(), found))
 
 
+def test_a_network_that_is_told_of_doubt_scores_otherwise_where_there_is_any() -> None:
+    ready, found = example()
+    network = told_network()
+    doubting = TesNet(replace(network.config, doubt=True)).eval()
+    state = network.state_dict()
+    layer = state["told.layer.weight"]
+    doubting.load_state_dict({**state, "told.layer.weight": torch.cat([layer, 0.1 * layer.abs()[:, :1] + 0.05], dim=1)})
+    doubted = replace(ready, pose_in_doubt=True)
+    assert torch.equal(told_score(doubting, found), told_score(network, found))
+    assert torch.equal(told_score(network, found, doubted), told_score(network, found))
+    change = (told_score(doubting, found, doubted) - told_score(doubting, found)).abs()
+    assert float((change > 1e-4).float().mean()) > 0.5
+
+
 @pytest.mark.parametrize("number", range(TOLD_INPUTS))
 def test_each_number_that_is_told_moves_scores_once_it_has_a_weight(number: int) -> None:
     network = told_network()
