@@ -73,7 +73,7 @@ PRESETS = {
     # many hands, objects and sensors. Few epochs, because a second look at a view teaches little.
     "product": Recipe(
         learning_rate=1e-3, weight_decay=0.02, max_epochs=4, candidates_per_view=160, blocked_per_view=40,
-        vary=True, network={"told": True, "caution": 8.0, "mirrored": 64, "evenness": 4.0, "rims": 4.0},
+        vary=True, network={"told": True, "doubt": True, "caution": 8.0, "mirrored": 64, "evenness": 4.0, "rims": 4.0},
     ),
     # The same for every network of a comparison. The last epoch is kept: choosing the best one would favour those whose
     # validation loss jumps about.

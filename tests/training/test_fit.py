@@ -545,7 +545,9 @@ def test_recipes_differ_from_the_default_in_what_is_told_of_them() -> None:
         "product": {
             "learning_rate": 1e-3, "weight_decay": 0.02, "max_epochs": 4, "candidates_per_view": 160,
             "blocked_per_view": 40, "vary": True,
-            "network": {"told": True, "caution": 8.0, "mirrored": 64, "evenness": 4.0, "rims": 4.0},
+            "network": {
+                "told": True, "doubt": True, "caution": 8.0, "mirrored": 64, "evenness": 4.0, "rims": 4.0,
+            },
         },
         "comparison": {
             "learning_rate": 1e-3, "max_epochs": 8, "views_per_step": 2, "blocked_per_view": 80, "keep": "last",
