@@ -69,8 +69,8 @@ PRESETS = {
     "default": Recipe(),
     # For weights that are good already (`start`), on many more views than they saw.
     "refine": Recipe(learning_rate=1e-3, weight_decay=0.02, max_epochs=3),
-    # The one network that is served, from the weights before it (`start`): told the hand and the noise, on folders of
-    # many hands, objects and sensors. Few epochs, because a second look at a view teaches little.
+    # The one network that is served, from the weights before it (`start`): told the hand, the noise and any doubt, on
+    # folders of many hands, objects and sensors. Few epochs, because a second look at a view teaches little.
     "product": Recipe(
         learning_rate=1e-3, weight_decay=0.02, max_epochs=4, candidates_per_view=160, blocked_per_view=40,
         vary=True, network={"told": True, "doubt": True, "caution": 8.0, "mirrored": 64, "evenness": 4.0, "rims": 4.0},

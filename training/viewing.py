@@ -141,9 +141,10 @@ def draw_viewing(camera: Camera, sensor: str | None, rng: np.random.Generator) -
 
 def sensor_of(name: str, rng: np.random.Generator) -> Sensor:
     """A sensor by its name; nothing is drawn unless it is `random` or `random-pose`."""
-    if name == RANDOM_POSE:
-        return replace(random_sensor(rng), calibration=_WRONG_POSE)
-    return random_sensor(rng) if name == RANDOM else SENSORS[cast(SensorName, name)]
+    if name not in (RANDOM, RANDOM_POSE):
+        return SENSORS[cast(SensorName, name)]
+    drawn = random_sensor(rng)
+    return replace(drawn, calibration=_WRONG_POSE) if name == RANDOM_POSE else drawn
 
 
 def viewings_of(description: Mapping[str, Any]) -> list[Viewing]:

@@ -256,11 +256,11 @@ class _Table:
             observed = self._ask(planner, observation, looks)
             observation += 1
             plan = observed.plan
-            unsure = self._is_unsure(plan) and len(looks) < LOOKS_IN_A_ROW
-            if unsure or not len(plan):
+            is_last = len(looks) == LOOKS_IN_A_ROW
+            if not len(plan) or (self._is_unsure(plan) and not is_last):
                 reason = UNSURE if len(plan) else plan.reason
                 self.no_grasps.append(NoGraspRecord(observed.observation, reason, plan.counts, plan.latency))
-                if len(looks) == LOOKS_IN_A_ROW:
+                if is_last:
                     return "no_grasps"
                 continue
             looks.clear()
@@ -283,7 +283,7 @@ class _Table:
 
     def _is_unsure(self, plan: Plan) -> bool:
         least = self._settings.look_again_below
-        return least is not None and len(plan) > 0 and bool(plan.scores[0] < least)
+        return least is not None and bool(plan.scores[0] < least)
 
     def _ask(self, planner: GraspPlanner, observation: int, looks: Sequence[Observation]) -> Observed:
         view = looks[-1] if self._settings.look_again_below is None else together(looks)
