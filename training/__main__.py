@@ -28,7 +28,7 @@ from training.mean import mean
 from training.second_look import EPOCHS as SECOND_LOOK_EPOCHS
 from training.second_look import learn_second_look
 from training.viewing import RANDOM, RANDOM_POSE, MoreViews
-from training.views import LabelsError
+from training.views import Fold, LabelsError
 
 
 def main(arguments: Sequence[str] | None = None) -> int:
@@ -63,6 +63,14 @@ def _positive(text: str) -> int:
     if value < 1:
         raise argparse.ArgumentTypeError(f"{value} is not positive")
     return value
+
+
+def _fold(text: str) -> Fold:
+    index, _, count = text.partition("/")
+    fold = Fold(int(index), int(count))
+    if not 0 <= fold.index < fold.count:
+        raise argparse.ArgumentTypeError(f"{text} is no fold; give 0/2 or 1/2, say")
+    return fold
 
 
 def _share(text: str) -> float | None:
@@ -239,6 +247,12 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
         default=(),
         help="folders of labelled scenes that fit the calibration of the served score; default: those of --validation",
     )
+    parser.add_argument(
+        "--leave-out",
+        type=_fold,
+        metavar="K/N",
+        help="of scenes whose numbers go round N folds, do not train on fold K, 0 to N - 1 (`second-look --scored-by`)",
+    )
     parser.add_argument("--preset", default="default", choices=sorted(RECIPES))
     parser.add_argument("--start", type=Path, metavar="WEIGHTS", help="begin with these instead of random weights")
     parser.add_argument("--epochs", type=_positive, help="stop after so many, whatever the schedule")
@@ -265,6 +279,7 @@ def _fit(options: argparse.Namespace) -> dict[str, object]:
         start=options.start,
         calibration=options.calibration,
         device=options.device,
+        leave_out=options.leave_out,
     )
 
 
@@ -313,6 +328,14 @@ def _centring(options: argparse.Namespace) -> dict[str, object]:
 
 def _add_second_look(parser: argparse.ArgumentParser) -> None:
     parser.add_argument("--weights", type=Path, required=True, help="of the network that looks first")
+    parser.add_argument(
+        "--scored-by",
+        type=Path,
+        nargs="+",
+        default=(),
+        metavar="WEIGHTS",
+        help="of those that `fit --leave-out 0/N`, `1/N` ... made, in this order; default: those of --weights",
+    )
     _add_of_scenes(parser, SECOND_LOOK_EPOCHS)
     parser.set_defaults(run=_second_look)
 
@@ -320,8 +343,8 @@ def _add_second_look(parser: argparse.ArgumentParser) -> None:
 def _second_look(options: argparse.Namespace) -> dict[str, object]:
     return learn_second_look(
         options.weights, options.archive, options.objects, options.samples, options.out,
-        scenes=options.scenes, workers=options.workers, epochs=options.epochs, seed=options.seed,
-        version=options.version,
+        scored_by=options.scored_by, scenes=options.scenes, workers=options.workers, epochs=options.epochs,
+        seed=options.seed, version=options.version,
     )  # fmt: skip
 
 

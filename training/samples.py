@@ -15,7 +15,7 @@ from torch import Tensor
 from tqdm import tqdm
 
 from tesnet.whole_file import write_whole
-from training.views import LabelsError
+from training.views import LabelsError, number_of
 
 _HELD_OUT = 20
 """One scene of so many is not trained on."""
@@ -70,7 +70,7 @@ def read_samples(folder: Path, stem: str) -> Samples:
         count = len(next(iter(arrays.values())))
         if not count:
             continue
-        scenes.append(torch.full((count,), int(file.stem.split("_")[1])))
+        scenes.append(torch.full((count,), number_of(file)))
         for name, array in arrays.items():
             columns.setdefault(name, []).append(array)
     return Samples({name: torch.cat(parts) for name, parts in columns.items()}, torch.cat(scenes))

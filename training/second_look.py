@@ -1,7 +1,8 @@
 """The second look at the best candidates: samples of an archive's scenes, and the fit to them.
 
-The network stays as it is; what looks again learns what it leaves to be told. So the scenes must be ones that the
-network was not trained on, or its logits are better than they will be where it is used.
+The network stays as it is; what looks again learns what it leaves to be told. So what scores the samples must not have
+been trained on their scenes, or its logits are better there than they will be where it is used. Where the network is
+the mean of several that were each trained without a part of the scenes, these score each its part.
 """
 
 from __future__ import annotations
@@ -31,7 +32,7 @@ from training import metrics
 from training.archive import SceneFile, for_each_scene, render_view
 from training.parts import ArchivedScene
 from training.samples import Samples, descend, read_samples, write_samples
-from training.views import LabelledView, LabelsError
+from training.views import LabelledView, LabelsError, number_of
 
 BEST = 64
 """So many candidates of a call are looked at again."""
@@ -58,26 +59,38 @@ def learn_second_look(
     samples: Path,
     out: Path,
     *,
+    scored_by: Sequence[Path] = (),
     scenes: int | None = None,
     workers: int = 1,
     epochs: int = EPOCHS,
     seed: int = 0,
     version: str = "0",
 ) -> dict[str, Any]:
-    """Draws samples from an archive's scenes and fits the second look of a network to them; see `sample` and `fit`."""
-    drawn = sample(file, archive, objects, samples, workers, scenes=scenes, seed=seed)
+    """Draws samples from an archive's scenes and fits the second look of a network to them; see `sample` and `fit`.
+
+    The samples are scored by that network unless there are others to do it (`scored_by`).
+    """
+    drawn = sample(scored_by or [file], archive, objects, samples, workers, scenes=scenes, seed=seed)
     return drawn | fit(file, samples, out, epochs=epochs, seed=seed, version=version)
 
 
 def sample(
-    file: Path, archive: Path, objects: str, out: Path, workers: int = 1, *, scenes: int | None = None, seed: int = 0
+    files: Sequence[Path],
+    archive: Path,
+    objects: str,
+    out: Path,
+    workers: int = 1,
+    *,
+    scenes: int | None = None,
+    seed: int = 0,
 ) -> dict[str, Any]:
     """Writes what fingers see, logits and outcomes, of candidates in an archive's scenes, as files in `out`.
 
     Files already there are left alone, so that a stopped run goes on.
 
     Args:
-        file: weights of the network.
+        files: weights of the network. Of N files the k-th scores the k-th of N folds, which it was trained without
+            (`Fold`; cross-fitting, Chernozhukov et al. 2018, section 3).
         archive: folder of `labels_*.npz`.
         objects: the object sets that the scenes were made of, joined with commas.
         out: folder for the files.
@@ -90,8 +103,9 @@ def sample(
         SimError: a worker failed.
         WeightsError: the weights cannot be used.
     """
-    _first_look(file)  # fail here, not in a worker
-    make = partial(_sample_scene, file=file)
+    for file in files:
+        _first_look(file)  # fail here, not in a worker
+    make = partial(_sample_scene, files=tuple(files))
     return {"scenes": for_each_scene(archive, objects, make, out, "looks", workers, scenes=scenes, seed=seed)}
 
 
@@ -113,8 +127,8 @@ def _first_look(file: Path) -> TesNet:
     return network.eval().requires_grad_(requires_grad=False)
 
 
-def _sample_scene(job: SceneFile, models: Mapping[str, ObjectModel], *, file: Path) -> None:
-    views = _views_of(job.scene, models, _first_look(file))
+def _sample_scene(job: SceneFile, models: Mapping[str, ObjectModel], *, files: Sequence[Path]) -> None:
+    views = _views_of(job.scene, models, _first_look(files[number_of(job.path) % len(files)]))
     columns = [np.concatenate(column) for column in zip(*views, strict=True)] if views else [np.zeros((0, INPUTS))] * 4
     write_samples(job.path, seen=columns[0], logits=columns[1], outcomes=columns[2], views=columns[3])
 

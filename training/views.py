@@ -248,8 +248,30 @@ def gripper_of(values: str | Mapping[str, Any]) -> Gripper:
     return HANDS[values].gripper if isinstance(values, str) else Gripper(**values)
 
 
-def scene_files(folders: Sequence[Path]) -> list[Path]:
-    """The scene files under the folders, sorted.
+def number_of(path: Path) -> int:
+    """The number of the scene that a file `STEM_NUMBER.npz` is of."""
+    return int(path.stem.rpartition("_")[2])
+
+
+@dataclass(frozen=True, slots=True)
+class Fold:
+    """Scenes that a network is trained without, so that its answers about them are those about any others.
+
+    Args:
+        index: of this fold, from 0.
+        count: of all; scenes go round them by their numbers.
+    """
+
+    index: int
+    count: int
+
+    def holds(self, path: Path) -> bool:
+        """Whether the scene of a file is in it."""
+        return number_of(path) % self.count == self.index
+
+
+def scene_files(folders: Sequence[Path], leave_out: Fold | None = None) -> list[Path]:
+    """The scene files under the folders, sorted, without those of a fold.
 
     Raises:
         LabelsError: a folder that does not exist or holds none.
@@ -259,7 +281,7 @@ def scene_files(folders: Sequence[Path]) -> list[Path]:
         files = sorted(folder.rglob("scene_*.npz"))
         if not files:
             raise LabelsError(f"{folder} holds no scene_*.npz; make some with `python -m training generate`")
-        found += files
+        found += [file for file in files if leave_out is None or not leave_out.holds(file)]
     return found
 
 
@@ -284,17 +306,22 @@ class StoredViews:
         folders: of scene files.
         preparation: that their clouds must have.
         wanted: which views there shall be, by whether their candidates succeed, (C,) bool.
+        leave_out: scenes that are left out.
 
     Raises:
         LabelsError: no scenes, or clouds that were prepared in another way; later, a file that was damaged since.
     """
 
     def __init__(
-        self, folders: Sequence[Path], preparation: PreparationConfig, wanted: Callable[[NDArray[np.bool_]], bool]
+        self,
+        folders: Sequence[Path],
+        preparation: PreparationConfig,
+        wanted: Callable[[NDArray[np.bool_]], bool],
+        leave_out: Fold | None = None,
     ) -> None:
         self.labels, self.successes = 0, 0
         self._places: list[tuple[Path, int]] = []
-        for path in scene_files(folders):
+        for path in scene_files(folders, leave_out):
             for number, success in enumerate(_successes(path, preparation)):
                 if wanted(success):
                     self._places.append((path, number))

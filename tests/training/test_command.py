@@ -16,6 +16,7 @@ from training.__main__ import main
 from training.fit import PRESETS
 from training.generate import GenerateConfig
 from training.viewing import MoreViews
+from training.views import Fold
 
 Told = list[dict[str, Any]]
 
@@ -69,7 +70,7 @@ FIT = {
     "model": "gpd", "data": ("one", "two"), "validation": ("three", "four"), "calibration": ("five", "six"),
     "preset": "paper", "start": "w.safetensors", "epochs": 3, "threads": 5, "seed": 9, "version": "1.2",
     "out": "o/new.w", "objects": "procedural,ycb", "more_views": 2, "camera": "top", "sensor": "d415",
-    "device": "cuda:1",
+    "device": "cuda:1", "leave_out": "1/3",
 }  # fmt: skip
 EVALUATE = {"model": "gpd", "weights": "w.safetensors", "data": ("one", "two"), "seed": 4}
 MEAN = {
@@ -80,7 +81,7 @@ CENTRING = {
     "archive": "packed", "objects": "procedural,ycb", "scenes": 12, "workers": 3, "samples": "drawn", "epochs": 4,
     "seed": 6, "version": "1.4", "out": "o/centring.w",
 }  # fmt: skip
-SECOND_LOOK = {"weights": "w.safetensors", **CENTRING, "version": "1.5"}
+SECOND_LOOK = {"weights": "w.safetensors", **CENTRING, "version": "1.5", "scored_by": ("c.w", "d.w")}
 COMPARE = {"data": "runs", "out": "tables", "validation": ("one", "two")}
 PACK = {"data": ("one", "two"), "out": "archive"}
 EVERY_OPTION: dict[str, dict[str, Any]] = {
@@ -156,9 +157,9 @@ def test_what_is_packed_rendered_averaged_measured_and_compared_is_what_the_opti
     files = {name: Path(str(CENTRING[name])) for name in ("archive", "samples", "out")}
     assert told["learn_centring"] == [CENTRING | files]
     assert main(["second-look", *words(SECOND_LOOK)]) == 0
-    files["file"] = Path("w.safetensors")
     asked = {name: value for name, value in SECOND_LOOK.items() if name != "weights"}
-    assert told["learn_second_look"] == [asked | files]
+    weights = {"file": Path("w.safetensors"), "scored_by": paths(["c.w", "d.w"])}
+    assert told["learn_second_look"] == [asked | files | weights]
     (evaluated,) = told["evaluate"]
     assert evaluated == {
         "name": "gpd", "path": Path("w.safetensors"), "data": paths(["one", "two"]), "seed": 4,
@@ -179,7 +180,7 @@ def test_what_is_trained_is_what_the_options_say(
             "name": "gpd", "data": [Path("one"), rendered if is_archive else Path("two")],
             "validation": paths(["three", "four"]), "calibration": paths(["five", "six"]), "recipe": PRESETS["paper"],
             "out": Path("o/new.w"), "epochs": 3, "threads": 5, "device": "cuda:1", "seed": 9, "version": "1.2",
-            "start": Path("w.safetensors"),
+            "start": Path("w.safetensors"), "leave_out": Fold(1, 3),
         }
     ]  # fmt: skip
     assert told["unpack"] == [
@@ -189,3 +190,10 @@ def test_what_is_trained_is_what_the_options_say(
             "preparation": networks.NETWORKS["gpd"][0].preparation,
         }
     ] * is_archive  # fmt: skip
+
+
+@pytest.mark.parametrize("fold", ["2/2", "-1/2", "1", "a/b"])
+def test_a_fold_that_there_is_not_is_refused(fold: str, capsys: pytest.CaptureFixture[str]) -> None:
+    with pytest.raises(SystemExit):
+        main(["fit", f"--leave-out={fold}", "--data", "a", "--validation", "b", "--out", "c"])
+    assert "--leave-out" in capsys.readouterr().err

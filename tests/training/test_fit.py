@@ -24,7 +24,7 @@ from training import fit as fitting
 from training import metrics
 from training.evaluate import evaluate
 from training.fit import PRESETS, Recipe, fit
-from training.views import LabelledView, LabelsError, StoredViews, load_views
+from training.views import Fold, LabelledView, LabelsError, StoredViews, load_views, save_scene
 
 Shown = tuple[PreparedCloud, Candidates, torch.Tensor]
 """A cloud, candidates of it and which of them are mirrored."""
@@ -492,6 +492,20 @@ def test_training_learns_the_training_views(folder: Path, tmp_path: Path) -> Non
     assert log[-1]["train_loss"] < 0.8 * log[0]["train_loss"]
 
 
+def test_scenes_that_are_left_out_are_not_trained_on(folder: Path, tmp_path: Path) -> None:
+    left_out = run(folder, tmp_path / "a.safetensors", leave_out=Fold(1, 2))
+    write(tmp_path / "even" / "train", [labelled_view(0)])
+    save_scene(tmp_path / "even" / "train" / "scene_0000002.npz", {"number": 2}, [labelled_view(2)])
+    fit(
+        "tesnet", [tmp_path / "even"], [folder / "validation"], RECIPE, tmp_path / "b.safetensors", threads=1
+    )  # fmt: skip
+    data = left_out["data"]
+    assert isinstance(data, dict)
+    assert (data["scenes"], data["views"], data["leave_out"]) == (3, 2, {"index": 1, "count": 2})
+    one, other = (weights.load(tmp_path / f"{name}.safetensors")[0] for name in "ab")
+    assert all(torch.equal(one[name], other[name]) for name in one)
+
+
 def test_labels_without_a_usable_view_are_refused(tmp_path: Path, folder: Path) -> None:
     write(tmp_path / "train", [labelled_view(0, positives=9)])
     with pytest.raises(LabelsError, match="10 successes and a failure; generate more"):
@@ -543,8 +557,8 @@ def test_recipes_differ_from_the_default_in_what_is_told_of_them() -> None:
         "default": {},
         "refine": {"learning_rate": 1e-3, "weight_decay": 0.02, "max_epochs": 3},
         "product": {
-            "learning_rate": 1e-3, "weight_decay": 0.02, "max_epochs": 4, "candidates_per_view": 160,
-            "blocked_per_view": 40, "vary": True,
+            "learning_rate": 7e-4, "weight_decay": 0.02, "views_per_step": 10, "max_epochs": 3,
+            "candidates_per_view": 160, "blocked_per_view": 40, "keep": "last", "vary": True,
             "network": {
                 "told": True, "doubt": True, "caution": 8.0, "mirrored": 64, "evenness": 4.0, "rims": 4.0,
             },

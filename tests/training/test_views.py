@@ -13,7 +13,7 @@ import torch
 from tesnet.cloud import PreparationConfig
 from tesnet.geometry import PANDA, Pose
 from tests.training.synthetic import labelled_view, write
-from training.views import LabelsError, StoredViews, load_scene, load_views, save_scene, scene_files
+from training.views import Fold, LabelsError, StoredViews, load_scene, load_views, save_scene, scene_files
 
 
 def test_labels_round_trip(tmp_path: Path) -> None:
@@ -139,6 +139,17 @@ def test_scenes_are_read_in_order_from_every_folder(tmp_path: Path) -> None:
     assert sum(1 for _ in load_views([tmp_path], PreparationConfig())) == 3
     with pytest.raises(LabelsError, match="python -m training generate"):
         scene_files([tmp_path / "c"])
+
+
+def test_folds_hold_every_scene_once_and_each_leaves_its_own_out(tmp_path: Path) -> None:
+    write(tmp_path, [labelled_view(number, count=30) for number in range(5)])
+    everything, folds = scene_files([tmp_path]), [Fold(index, 3) for index in range(3)]
+    kept = [scene_files([tmp_path], leave_out=fold) for fold in folds]
+    assert [[int(path.stem[-7:]) for path in files] for files in kept] == [[1, 2, 4], [0, 2, 3], [0, 1, 3, 4]]
+    assert [[fold.holds(path) for fold in folds].count(True) for path in everything] == [1] * 5
+    stored = StoredViews([tmp_path], PreparationConfig(), lambda _: True, folds[0])
+    assert torch.equal(stored[2].poses, load_scene(everything[4])[1][0].poses)
+    assert len(stored) == 3
 
 
 def test_stored_views_are_those_of_the_files_and_are_not_kept(tmp_path: Path) -> None:
