@@ -7,10 +7,12 @@ the service refuses (4xx); 3 the service cannot be reached, is overloaded or fai
 from __future__ import annotations
 
 import argparse
+import itertools
 import os
 import signal
 import sys
 from collections.abc import Sequence
+from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
@@ -183,13 +185,18 @@ def _hand_or_size(text: str) -> tuple[str, str | float]:
     if separator:
         return name, _number(value)
     if not text.isidentifier():
-        raise argparse.ArgumentTypeError(f"{text} is neither a hand's name nor SIZE=METRES")
+        raise argparse.ArgumentTypeError(
+            f"{text} is neither a hand's name nor SIZE=METRES; if it is the cloud, give it before --gripper"
+        )
     return "name", text
 
 
 def _gripper(given: Sequence[tuple[str, str | float]]) -> str | GripperSize:
     if len(given) == 1 and given[0][0] == "name":
         return str(given[0][1])
+    for name, values in itertools.groupby(sorted(given, key=itemgetter(0)), key=itemgetter(0)):
+        if len(several := [str(value) for _, value in values]) > 1:
+            raise InvalidArgument("--gripper", f"{name} is {' and '.join(several)}; give it once")
     return cast("GripperSize", dict(given))
 
 

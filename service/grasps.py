@@ -325,7 +325,7 @@ def check_hand(query: GraspQuery, model: ModelInfo) -> None:
         Invalid: names the network that does.
     """
     if query.gripper != PANDA and model.name != _ANY_HAND:
-        raise Invalid("gripper", f"is another hand, but {model.name} knows the Panda hand alone; ask {_ANY_HAND}")
+        raise Invalid("gripper", f"is another hand, but {model.name} knows the Franka hand alone; ask {_ANY_HAND}")
 
 
 def _retrieve(answer: asyncio.Future[Answer]) -> None:

@@ -210,9 +210,10 @@ class GraspOptions(RequestPart):
     )
     gripper: GripperSize | Annotated[str, Field(max_length=64)] | None = Field(
         default=None,
-        description=f"The hand: one of {', '.join(HANDS)}, or sizes "
-        '{"max_width": metres, "finger_depth": metres, ...}, with a "name" those of that hand but for the sizes given. '
-        f"It opens at most {WIDEST:g}. Default: franka.",
+        description=f"The hand: a name, one of {', '.join(HANDS)}; or sizes "
+        '{"max_width": metres, "finger_depth": metres, ...}; or both, {"name": ..., ...}, the named hand with the '
+        "sizes that differ. Sizes left out are Franka's, so `hand_pose` needs `hand_to_tcp` and `hand_yaw`. It opens "
+        f"at most {WIDEST:g}. Default: franka.",
     )
     width: Literal["fitted", "full"] | None = Field(
         default=None,

@@ -5,6 +5,7 @@ from __future__ import annotations
 import argparse
 import json
 import math
+import re
 import sys
 from collections.abc import Sequence
 from pathlib import Path
@@ -66,11 +67,10 @@ def _positive(text: str) -> int:
 
 
 def _fold(text: str) -> Fold:
-    index, _, count = text.partition("/")
-    fold = Fold(int(index), int(count))
-    if not 0 <= fold.index < fold.count:
+    found = re.fullmatch(r"(\d+)/(\d+)", text)
+    if found is None or not int(found[1]) < int(found[2]) > 1:
         raise argparse.ArgumentTypeError(f"{text} is no fold; give 0/2 or 1/2, say")
-    return fold
+    return Fold(int(found[1]), int(found[2]))
 
 
 def _share(text: str) -> float | None:
@@ -251,7 +251,8 @@ def _add_fit(parser: argparse.ArgumentParser) -> None:
         "--leave-out",
         type=_fold,
         metavar="K/N",
-        help="of scenes whose numbers go round N folds, do not train on fold K, 0 to N - 1 (`second-look --scored-by`)",
+        help="of scenes whose numbers go round N folds, do not train on fold K, 0 to N - 1; for `second-look "
+        "--scored-by`, whose archive --data must be, or rendered from it",
     )
     parser.add_argument("--preset", default="default", choices=sorted(RECIPES))
     parser.add_argument("--start", type=Path, metavar="WEIGHTS", help="begin with these instead of random weights")

@@ -101,7 +101,7 @@ class _Progress:
     """What a checkpoint holds beside the tensors.
 
     Args:
-        recipe, seed: of the run.
+        recipe, seed, leave_out: of the run.
         learning_rate: now.
         epoch: epochs done.
         best_loss: least validation loss of them.
@@ -120,6 +120,7 @@ class _Progress:
     step: int = 0
     loss: float = 0.0
     seconds: float = 0.0
+    leave_out: dict[str, int] | None = None
 
 
 def fit(
@@ -161,7 +162,8 @@ def fit(
         start: weights to begin with, also older ones with fewer inputs; None for random ones.
         calibration: folders of labelled scenes that fit the calibration; those of `validation` unless given.
         device: that computes: `cpu`, `cuda`, `cuda:1` ...
-        leave_out: scenes of `data` that are not trained on, so that the second look can learn of them.
+        leave_out: scenes of `data`, by the numbers of their files, that are not trained on, so that the second look can
+            learn of them. These are the archive's numbers where `data` was rendered from it.
 
     Raises:
         DeviceError: this machine does not have the device.
@@ -187,9 +189,11 @@ def fit(
     labels, prior = train_views.labels, train_views.successes / train_views.labels
     optimiser = _optimiser(network, recipe)
     checkpoint = out.with_suffix(".checkpoint")
-    progress = _resume(checkpoint, network, optimiser) or _Progress(asdict(recipe), seed, recipe.learning_rate)
-    if (Recipe(**progress.recipe), progress.seed) != (recipe, seed):
-        raise LabelsError(f"{checkpoint} is of another recipe or seed; use the same ones, or another --out")
+    without = None if leave_out is None else asdict(leave_out)
+    begun = _Progress(asdict(recipe), seed, recipe.learning_rate, leave_out=without)
+    progress = _resume(checkpoint, network, optimiser) or begun
+    if (Recipe(**progress.recipe), progress.seed, progress.leave_out) != (recipe, seed, without):
+        raise LabelsError(f"{checkpoint} is of another recipe, seed or fold; use the same ones, or another --out")
     approach_points = APPROACH_POINTS_PER_STEP.get(name)
     last_epoch = min(recipe.max_epochs, epochs or recipe.max_epochs)
     # Only halving ends the training: along the cosine the rate is small at the start, too.
@@ -218,7 +222,7 @@ def fit(
             training = {
                 "data": {
                     "scenes": len(scene_files(data, leave_out)), "views": len(train_views), "labels": labels,
-                    "prior": prior, "leave_out": leave_out and asdict(leave_out),
+                    "prior": prior, "leave_out": without,
                 },
                 "recipe": asdict(recipe), "approach_points_per_step": approach_points, "seed": seed,
                 "epoch": progress.epoch, "validation": measures, "validation_with_blocked": of_all,

@@ -8,7 +8,7 @@ the mean of several that were each trained without a part of the scenes, these s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import replace
+from dataclasses import asdict, replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from training import metrics
 from training.archive import SceneFile, for_each_scene, render_view
 from training.parts import ArchivedScene
 from training.samples import Samples, descend, read_samples, write_samples
-from training.views import LabelledView, LabelsError, number_of
+from training.views import Fold, LabelledView, LabelsError, number_of
 
 BEST = 64
 """So many candidates of a call are looked at again."""
@@ -99,14 +99,27 @@ def sample(
         seed: of the draw.
 
     Raises:
-        LabelsError: no archive, or objects that the sets do not hold.
+        LabelsError: no archive, objects that the sets do not hold, or weights that were trained without another fold
+            than the one that they are to score.
         SimError: a worker failed.
         WeightsError: the weights cannot be used.
     """
-    for file in files:
-        _first_look(file)  # fail here, not in a worker
+    for index, file in enumerate(files):  # fail here, not in a worker
+        _first_look(file)
+        _check_fold(file, Fold(index, len(files)))
     make = partial(_sample_scene, files=tuple(files))
     return {"scenes": for_each_scene(archive, objects, make, out, "looks", workers, scenes=scenes, seed=seed)}
+
+
+def _check_fold(file: Path, scores: Fold) -> None:
+    """Raises LabelsError where a file says that it was trained without another fold than it scores."""
+    _, header = _loaded(file)
+    without = ((header.training or {}).get("data") or {}).get("leave_out")
+    if scores.count > 1 and without not in (None, asdict(scores)):
+        raise LabelsError(
+            f"{file} was trained without fold {without['index']}/{without['count']} and is to score "
+            f"{scores.index}/{scores.count}; give the weights of all folds in their order"
+        )
 
 
 def _loaded(file: Path) -> tuple[TesNet, weights.Header]:

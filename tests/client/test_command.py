@@ -311,6 +311,7 @@ def test_flags_left_out_stay_the_service_s_defaults(server: ScriptedServer, clou
         ["c.ply", "--support-height", "low", "--up", "0", "0", "1"],
         ["c.ply", "--gripper", "0.06"],
         ["c.ply", "--gripper", "max_width=wide"],
+        ["--gripper", "rg2", "c.ply"],
         ["c.ply", "--mask", "mask.png"],
         ["c.ply", "--depth-scale", "0.001"],
         ["absent.png", "--intrinsics", "1", "1", "0", "0"],
@@ -323,6 +324,14 @@ def test_wrong_usage_and_unreadable_files_exit_2_with_one_reason(
         sys.exit(main(arguments))
     assert end.value.code == 2
     assert "python -m client: " in capsys.readouterr().err
+
+
+@pytest.mark.parametrize("twice", ["rg2 hand_e", "rg2 max_width=0.05 max_width=0.06"])
+def test_a_hand_or_a_size_given_twice_is_refused(cloud: str, twice: str, capsys: pytest.CaptureFixture[str]) -> None:
+    assert main([cloud, "--gripper", *twice.split()]) == 2
+    said = capsys.readouterr().err
+    assert all(word.rpartition("=")[2] in said for word in twice.split()[-2:])
+    assert "give it once" in said
 
 
 @pytest.mark.parametrize(("status", "code"), [(400, 2), (413, 2), (422, 2), (429, 3), (500, 3), (503, 3), (504, 3)])

@@ -379,8 +379,9 @@ def test_a_step_may_show_the_candidates_of_few_approach_points() -> None:
 
 def test_a_checkpoint_of_another_recipe_is_refused(folder: Path, tmp_path: Path) -> None:
     run(folder, tmp_path / "a.safetensors", epochs=1)
-    for options in ({"recipe": replace(RECIPE, learning_rate=1e-3)}, {"seed": 1}):
-        with pytest.raises(LabelsError, match=r"a\.checkpoint is of another recipe or seed"):
+    other = {"recipe": replace(RECIPE, learning_rate=1e-3)}, {"seed": 1}, {"leave_out": Fold(0, 2)}
+    for options in other:
+        with pytest.raises(LabelsError, match=r"a\.checkpoint is of another recipe, seed or fold"):
             run(folder, tmp_path / "a.safetensors", **options)
 
 

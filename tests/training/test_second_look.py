@@ -2,6 +2,7 @@
 
 from __future__ import annotations
 
+from dataclasses import replace
 from pathlib import Path
 
 import numpy as np
@@ -21,7 +22,7 @@ from training.archive import pack, render_view
 from training.generate import GenerateConfig
 from training.generate import generate as make_labels
 from training.parts import read_part
-from training.views import LabelsError
+from training.views import Fold, LabelsError
 
 SHIPPED = weights.default_weights()
 SUCCESS, APPROACH, DROP = (OUTCOME_KINDS.index(kind) for kind in ("success", "approach", "drop"))
@@ -58,6 +59,19 @@ def test_samples_are_what_fingers_see_of_free_candidates_with_the_first_looks_lo
     before = [file.stat().st_mtime_ns for file in files]
     assert second_look.sample(*asked) == told
     assert [file.stat().st_mtime_ns for file in files] == before
+
+
+def test_weights_of_another_fold_are_not_asked_about_scenes_that_they_were_taught(tmp_path: Path) -> None:
+    state, header = weights.load(SHIPPED)
+    files = [tmp_path / f"{index}.safetensors" for index in range(2)]
+    for index, file in enumerate(files):
+        training = {"data": {"leave_out": {"index": index, "count": 2}}}
+        weights.save(file, state, replace(header, training=training))
+        second_look._check_fold(file, Fold(index, 2))
+    second_look._check_fold(files[1], Fold(0, 1))
+    second_look._check_fold(SHIPPED, Fold(1, 2))
+    with pytest.raises(LabelsError, match=r"without fold 1/2 and is to score 0/2; give the weights of all"):
+        second_look.sample(files[::-1], tmp_path, "procedural-train", tmp_path / "samples")
 
 
 def write_samples(folder: Path, scenes: int = 40, each: int = 120) -> None:
