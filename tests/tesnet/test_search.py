@@ -26,8 +26,10 @@ def test_what_is_free_is_what_a_check_of_every_fitted_hand_leaves(hand: Gripper,
     free = ~blocked(cloud, every, query.unseen)
     assert 20 < int(free.sum()) < len(every)
     assert torch.equal(found.is_free, free)
-    assert torch.equal(found.candidates.Ts_canonical_grasp[free], every.Ts_canonical_grasp[free])
-    assert torch.equal(found.candidates.widths[free], every.widths[free])
+    # The search fits fewer hands at a time; how a matrix product is rounded may depend on its size.
+    for name in ("Ts_canonical_grasp", "widths"):
+        one, other = (getattr(candidates, name)[free] for candidates in (found.candidates, every))
+        torch.testing.assert_close(one, other, atol=1e-6, rtol=0)
     assert found.rejected == rejected | {"collision": int((~free).sum())}
 
 
