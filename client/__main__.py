@@ -7,12 +7,10 @@ the service refuses (4xx); 3 the service cannot be reached, is overloaded or fai
 from __future__ import annotations
 
 import argparse
-import itertools
 import os
 import signal
 import sys
 from collections.abc import Sequence
-from operator import itemgetter
 from pathlib import Path
 from typing import Any, cast
 
@@ -194,10 +192,12 @@ def _hand_or_size(text: str) -> tuple[str, str | float]:
 def _gripper(given: Sequence[tuple[str, str | float]]) -> str | GripperSize:
     if len(given) == 1 and given[0][0] == "name":
         return str(given[0][1])
-    for name, values in itertools.groupby(sorted(given, key=itemgetter(0)), key=itemgetter(0)):
-        if len(several := [str(value) for _, value in values]) > 1:
-            raise InvalidArgument("--gripper", f"{name} is {' and '.join(several)}; give it once")
-    return cast("GripperSize", dict(given))
+    hand: dict[str, str | float] = {}
+    for name, value in given:
+        if name in hand:
+            raise InvalidArgument("--gripper", f"{name} is {hand[name]} and {value}; give it once")
+        hand[name] = value
+    return cast("GripperSize", hand)
 
 
 def _parser() -> argparse.ArgumentParser:

@@ -37,6 +37,7 @@ from training.views import (
     check_preparation,
     count_outcomes,
     load_scene,
+    number_of,
     save_scene,
     scene_files,
 )
@@ -64,7 +65,7 @@ def pack(folders: Sequence[Path], out: Path) -> dict[str, Any]:
     out.mkdir(parents=True, exist_ok=True)
     there = sorted(out.glob("labels_*.npz"))
     known = {key for part in there for key in keys_of(part)}
-    first_part = 1 + max((int(path.stem.split("_")[1]) for path in there), default=-1)
+    first_part = 1 + max(map(number_of, there), default=-1)
     scenes = (scene for scene in map(_read_scene, scene_files(folders)) if scene.key is None or scene.key not in known)
     for part in itertools.count(first_part):
         if not (some := list(itertools.islice(scenes, SCENES_PER_PART))):

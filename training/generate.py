@@ -36,7 +36,7 @@ from tesnet.search import search
 from tesnet.whole_file import write_whole
 from training.hands import drawn_hand
 from training.viewing import Camera, Viewing, draw_viewing
-from training.views import LabelledView, LabelsError, count_outcomes, save_scene, scene_files
+from training.views import LabelledView, LabelsError, count_outcomes, number_of, save_scene, scene_files
 
 _HEAR_S = 1.0
 _HANDS_STREAM = 1_000_000
@@ -109,7 +109,7 @@ def generate(
     settings = {key: _plain(value) for key, value in asdict(config).items()}
     _claim(out, settings, resume)
     object_sets(config)  # fail here, not in a worker
-    done = {int(path.stem.split("_")[1]) for path in out.glob("scene_*.npz")}
+    done = {number_of(path) for path in out.glob("scene_*.npz")}
     counts = np.zeros(len(OUTCOME_KINDS), dtype=np.int64)
     for path in scene_files([out]) if done else []:
         with np.load(path, allow_pickle=False) as stored:

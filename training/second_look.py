@@ -8,7 +8,7 @@ the mean of several that were each trained without a part of the scenes, these s
 from __future__ import annotations
 
 from collections.abc import Mapping, Sequence
-from dataclasses import asdict, replace
+from dataclasses import replace
 from functools import cache, partial
 from pathlib import Path
 from typing import Any
@@ -32,7 +32,7 @@ from training import metrics
 from training.archive import SceneFile, for_each_scene, render_view
 from training.parts import ArchivedScene
 from training.samples import Samples, descend, read_samples, write_samples
-from training.views import Fold, LabelledView, LabelsError, number_of
+from training.views import Fold, LabelledView, LabelsError, fold_of
 
 BEST = 64
 """So many candidates of a call are looked at again."""
@@ -105,7 +105,6 @@ def sample(
         WeightsError: the weights cannot be used.
     """
     for index, file in enumerate(files):  # fail here, not in a worker
-        _first_look(file)
         _check_fold(file, Fold(index, len(files)))
     make = partial(_sample_scene, files=tuple(files))
     return {"scenes": for_each_scene(archive, objects, make, out, "looks", workers, scenes=scenes, seed=seed)}
@@ -114,11 +113,11 @@ def sample(
 def _check_fold(file: Path, scores: Fold) -> None:
     """Raises LabelsError where a file says that it was trained without another fold than it scores."""
     _, header = _loaded(file)
-    without = ((header.training or {}).get("data") or {}).get("leave_out")
-    if scores.count > 1 and without not in (None, asdict(scores)):
+    said = ((header.training or {}).get("data") or {}).get("leave_out")
+    if scores.count > 1 and said is not None and (without := Fold(**said)) != scores:
         raise LabelsError(
-            f"{file} was trained without fold {without['index']}/{without['count']} and is to score "
-            f"{scores.index}/{scores.count}; give the weights of all folds in their order"
+            f"{file} was trained without fold {without} and is to score {scores}; "
+            "give the weights of all folds in their order"
         )
 
 
@@ -141,7 +140,7 @@ def _first_look(file: Path) -> TesNet:
 
 
 def _sample_scene(job: SceneFile, models: Mapping[str, ObjectModel], *, files: Sequence[Path]) -> None:
-    views = _views_of(job.scene, models, _first_look(files[number_of(job.path) % len(files)]))
+    views = _views_of(job.scene, models, _first_look(files[fold_of(job.path, len(files))]))
     columns = [np.concatenate(column) for column in zip(*views, strict=True)] if views else [np.zeros((0, INPUTS))] * 4
     write_samples(job.path, seen=columns[0], logits=columns[1], outcomes=columns[2], views=columns[3])
 

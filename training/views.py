@@ -249,8 +249,13 @@ def gripper_of(values: str | Mapping[str, Any]) -> Gripper:
 
 
 def number_of(path: Path) -> int:
-    """The number of the scene that a file `STEM_NUMBER.npz` is of."""
+    """The number in the name of a file `STEM_NUMBER.npz`, of a scene or of a part of an archive."""
     return int(path.stem.rpartition("_")[2])
+
+
+def fold_of(path: Path, count: int) -> int:
+    """The index, from 0, of the one of so many folds that holds the scene of a file: scenes go round them by number."""
+    return number_of(path) % count
 
 
 @dataclass(frozen=True, slots=True)
@@ -259,7 +264,7 @@ class Fold:
 
     Args:
         index: of this fold, from 0.
-        count: of all; scenes go round them by their numbers.
+        count: of all (`fold_of`).
     """
 
     index: int
@@ -267,7 +272,10 @@ class Fold:
 
     def holds(self, path: Path) -> bool:
         """Whether the scene of a file is in it."""
-        return number_of(path) % self.count == self.index
+        return fold_of(path, self.count) == self.index
+
+    def __str__(self) -> str:
+        return f"{self.index}/{self.count}"
 
 
 def scene_files(folders: Sequence[Path], leave_out: Fold | None = None) -> list[Path]:

@@ -497,9 +497,7 @@ def test_scenes_that_are_left_out_are_not_trained_on(folder: Path, tmp_path: Pat
     left_out = run(folder, tmp_path / "a.safetensors", leave_out=Fold(1, 2))
     write(tmp_path / "even" / "train", [labelled_view(0)])
     save_scene(tmp_path / "even" / "train" / "scene_0000002.npz", {"number": 2}, [labelled_view(2)])
-    fit(
-        "tesnet", [tmp_path / "even"], [folder / "validation"], RECIPE, tmp_path / "b.safetensors", threads=1
-    )  # fmt: skip
+    fit("tesnet", [tmp_path / "even"], [folder / "validation"], RECIPE, tmp_path / "b.safetensors", threads=1)
     data = left_out["data"]
     assert isinstance(data, dict)
     assert (data["scenes"], data["views"], data["leave_out"]) == (3, 2, {"index": 1, "count": 2})
